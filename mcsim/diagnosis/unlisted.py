@@ -86,7 +86,7 @@ def structures_of(data: ObservedMaps, scene: Scene, search: Search) -> tuple[tup
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """Simulated skies: the maps of the first, and mean scores, shape (P,), and data vectors, shape (p,), of all."""
+    """Simulated skies: maps of the first, mean scores, shape (P,), and data vectors, shape (p,) or (0,), of all."""
 
     maps: list[Map]
     scores: Vector
@@ -108,8 +108,11 @@ class Reconstruction:
     _trial: dict[int, tuple[Matrix, Matrix]] = field(default_factory=dict, repr=False)
     _kept: dict[int, tuple[Vector, Vector]] = field(default_factory=dict, repr=False)
 
-    def simulated(self, effects: Sequence[Plugin], share: Vector | None = None) -> Simulated:
-        """Return maps, scores and data vectors of skies that the data constrain, with effects or shares of them."""
+    def simulated(self, effects: Sequence[Plugin], share: Vector | None = None, tested: bool = False) -> Simulated:
+        """Return maps and scores of skies that the data constrain, with effects or shares of them.
+
+        ``tested``: the data vectors, too, which cost as much.
+        """
         analysis = self.data.context.analysis
         kinds = {one.name: one.kind() for one in effects}
         acting = [(one.name, None if kinds[one.name].scope == "common" else one.channel) for one in effects]
@@ -122,12 +125,13 @@ class Reconstruction:
             pairs = zip(maps, simulated_maps(plain), strict=True)
             maps = [[a + f * (b - a) for f, a, b in zip(share, one, made, strict=True)] for made, one in pairs]
         scores_ = [scores_of_maps(analysis.model, self.scene, one) for one in maps]
-        return Simulated(maps[0], np.mean(scores_, axis=0), np.mean([analysis.data_vector(m) for m in maps], axis=0))
+        x = np.mean([analysis.data_vector(m) for m in maps], axis=0) if tested else np.zeros(0)
+        return Simulated(maps[0], np.mean(scores_, axis=0), x)
 
     @cached_property
     def before(self) -> Simulated:
         """Return the same without effects."""
-        return self.simulated([])
+        return self.simulated([], tested=True)
 
     def fitted(self, chosen: Sequence[int]) -> Fitted:
         """Return coordinates and covariance of structures, their effects at amplitudes that fit, and what these leave.
@@ -159,7 +163,9 @@ class Reconstruction:
             if structure.by_coordinate:
                 each = float(np.linalg.norm(theta)) * np.eye(structure.size)
             shape, share = structure, None
-            if structure.stage == "beam" and structure.split != ALIKE:  # no effect, but that of all splits in some maps
+            if (
+                structure.stage in ("beam", "elsewhere", "noise") and structure.split != ALIKE
+            ):  # that of all, in some maps
                 shape, share = replace(structure, split=ALIKE), np.zeros(len(self.scene.views))
                 share[list(structure.views)] = structure.weights
             effects = [plugin("unlisted", shape, one, self.scene) for one in each]
@@ -228,7 +234,8 @@ class Reconstruction:
         splits = [view.split for view in self.scene.views]
         first = []
         for structure, effect in acting:
-            if structure.views and len(self.scene.splits) > 1 and not structure.by_coordinate:
+            by_map = structure.views and not structure.by_coordinate and structure.stage != "noise"
+            if by_map and len(self.scene.splits) > 1:
                 if not len((half := structure.within(0, splits)).weights):
                     return None
                 ((theta, _),) = self.search.fit([half], self.x)
@@ -237,12 +244,12 @@ class Reconstruction:
         matrix, told = self.data.halves()
         if (halves := Halves.of(context.ensemble.remix(matrix), matrix @ self.data.x)) is None:
             return None
-        t = np.stack([matrix @ (self.simulated([one]).x - self.before.x) for one in first], axis=1)
+        t = np.stack([matrix @ (self.simulated([one], tested=True).x - self.before.x) for one in first], axis=1)
         if halves.expected_snr(t.sum(axis=1)) < settings.half_snr_share * context.null.expected_snr(t.sum(axis=1)):
             return None
 
         def respond(frozen: Fit) -> Vector:
             scaled = [one.scaled(float(a)) for one, a in zip(first, frozen.amplitudes, strict=True)]
-            return np.asarray(matrix @ (self.simulated(scaled).x - self.before.x))
+            return np.asarray(matrix @ (self.simulated(scaled, tested=True).x - self.before.x))
 
         return replace(halves, largest=LARGEST).reduction(t, respond, (), told)

@@ -5,23 +5,17 @@ from mcsim.reconstruction.forms import (
     AddedToSamples,
     BeamOrder,
     BoostedSky,
+    Elsewhere,
+    GainOfOne,
     GainOverTime,
     GainPattern,
     NoisePattern,
     RotatedSky,
     SignalPower,
     SkyPower,
-)
+)  # fmt: skip
 
 __all__ = [
-    "AddedPattern",
-    "AddedToSamples",
-    "BeamOrder",
-    "BoostedSky",
-    "GainOverTime",
-    "GainPattern",
-    "NoisePattern",
-    "RotatedSky",
-    "SignalPower",
-    "SkyPower",
-]
+    "AddedPattern", "AddedToSamples", "BeamOrder", "BoostedSky", "Elsewhere", "GainOfOne", "GainOverTime",
+    "GainPattern", "NoisePattern", "RotatedSky", "SignalPower", "SkyPower",
+]  # fmt: skip

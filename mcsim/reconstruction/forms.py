@@ -25,7 +25,7 @@ from mcsim.systematics.base import Alm, Draw, Effect, Map, Site
 from mcsim.systematics.parametrization import Parametrization, Vector
 from mcsim.systematics.product import multiplied
 from mcsim.systematics.sky import Boost
-from mcsim.systematics.spacecraft import axes, heading, spin_phase
+from mcsim.systematics.spacecraft import axes, heading, orientation, spin_phase
 
 REFERENCE_GHZ = 94.0
 _NSIDE = 128  #: of the map that a pattern of low degree is looked up in
@@ -174,8 +174,8 @@ class BeamOrder(Form):
 class InTime(Form):
     """Derive forms that depend on time from this class."""
 
-    #: "": constant; "spin": ``harmonic`` times the spin phase; "year"; "orientation": ``harmonic`` times psi; of what
-    #: is added also "sky": a pattern, and those of :meth:`AddedToSamples.components`
+    #: "": constant; "spin", "year", "orientation": ``harmonic`` times spin phase, year or psi; "trend": from -1 to 1
+    #: through the survey; of what is added also "sky": a pattern, and those of :meth:`AddedToSamples.components`
     wave: ClassVar[str] = ""
     harmonic: ClassVar[int] = 1
     #: of cosine and sine, of this and of each further harmonic, or of the pattern, or of components, or the constant
@@ -194,16 +194,19 @@ class InTime(Form):
         """Return constant or wave."""
         if not self.wave:
             return np.full(len(time_s), self.coefficients[0])
+        pointing = site.pointed(self.name)
+        if self.wave == "trend":
+            return self.coefficients[0] * (2.0 * time_s / (pointing.model.duration_days * SECONDS_PER_DAY) - 1.0)
         if self.wave == "spin":
-            phase, order = spin_phase(site.pointed(self.name), time_s), self.harmonic
+            phase = spin_phase(pointing, time_s)
         elif self.wave == "year":
-            phase, order = 2.0 * np.pi * time_s / site.pointed(self.name).model.orbit_period_s, 1
+            phase = 2.0 * np.pi * time_s / pointing.model.orbit_period_s
         else:
-            assert psi is not None
-            phase, order = psi, self.harmonic
+            phase = orientation(pointing, time_s, site.frame) if psi is None else psi
         found = np.zeros(len(time_s))
         for k, (cosine, sine) in enumerate(zip(self.coefficients[::2], self.coefficients[1::2], strict=True)):
-            found += cosine * np.cos((order + k) * phase) + sine * np.sin((order + k) * phase)
+            turned = (self.harmonic + k) * phase
+            found += cosine * np.cos(turned) + sine * np.sin(turned)
         return found
 
 
@@ -244,6 +247,48 @@ class GainOverTime(InTime):
         if self.amplitude == 0.0:
             return None
         return np.asarray(self.amplitude * self.factor(time_s, site) * self.over_time(time_s, None, site))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GainOfOne(GainOverTime):
+    """The gain of the sky alone varies, or that of the dipole alone."""
+
+    on_sky: ClassVar[bool]
+
+    def gain(self, time_s: Vector, site: Site) -> Vector | None:
+        return super().gain(time_s, site) if self.on_sky else None
+
+    def signal(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> Vector:
+        dipole = site.dipole_uk @ axes(theta, phi)[0] * self.factor(time_s, site) * self.over_time(time_s, psi, site)
+        return np.asarray((-1.0 if self.on_sky else 1.0) * self.amplitude * dipole)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Elsewhere(Form):
+    """Samples have a part of the signal that the beam would have in another direction of its own frame.
+
+    ``factor`` times sky and dipole there, or the sky alone, up to l = ``top``: a lobe has as many orders.
+    """
+
+    towards: ClassVar[tuple[float, float, float]]  #: unit vector, along x and y of the beam and outward
+    factor: ClassVar[float]
+    on_dipole: ClassVar[bool] = True
+    top: ClassVar[int]
+
+    def beam(self, beam: Beam, site: Site) -> Beam:
+        """Add Y*_lm of the direction, as of a beam that points there."""
+        top = min(self.top, beam.lmax)
+        angles = np.array(healpy.vec2dir(np.array(self.towards)))[None]
+        one = np.ones((1, 1))
+        lobe = ducc0.sht.adjoint_synthesis_general(map=one, loc=angles, spin=0, lmax=top, epsilon=1e-10, nthreads=1)[0]
+        kernel = site.beam.blm[0, : top + 1].real * np.sqrt(4.0 * np.pi / (2.0 * np.arange(top + 1) + 1.0))
+        kernel[: 0 if self.on_dipole else 2] = 0.0
+        blm = np.zeros((max(beam.mmax, top) + 1, beam.lmax + 1), dtype=np.complex128)
+        blm[: beam.mmax + 1] = beam.blm
+        for m in range(top + 1):
+            here = slice(alm_.start(top, m) + m, alm_.start(top, m) + top + 1)
+            blm[m, m : top + 1] += self.amplitude * self.factor * kernel[m:] * lobe[here]
+        return replace(beam, blm=blm)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -329,7 +374,7 @@ FORMS: dict[str, type[Form]] = {
     kind.__name__: kind
     for kind in (
         AddedPattern, GainPattern, RotatedSky, BoostedSky, SignalPower, SkyPower, BeamOrder, AddedToSamples,
-        GainOverTime, NoisePattern,
+        GainOverTime, GainOfOne, Elsewhere, NoisePattern,
     )
 }  # fmt: skip
 """The forms by the name of their class."""

@@ -13,17 +13,16 @@ from numpy.typing import NDArray
 from scipy.special import poch
 
 from mcsim.reconstruction.forms import REFERENCE_GHZ
-from mcsim.reconstruction.scores import ELONGATION, GAIN, GAIN_WAVES, MODULATION, ORDERS, Key, Scene
+from mcsim.reconstruction.scores import ACTED_ON, ELONGATION, GAIN, HARMONICS, MODULATION, ORDERS, Key, Scene, View
 from mcsim.sphere import real
 from mcsim.sphere.rotation import rotation_matrix
 from mcsim.support.arrays import Matrix, Vector
-from mcsim.systematics.spacecraft import axes
 
 ALIKE, OPPOSITE = "alike", "opposite"
 
 FREE = 5  #: coordinates of a pattern on the sky whose responses are simulated one by one, at most
 
-SPIN = 4  #: highest harmonic of the spin phase that is said by itself
+ANY = f"1-{HARMONICS}"  #: of a wave in any way: a constant and all harmonics
 
 ALSO_COMMON = ("monopole", "dipole", "degrees 0-1")
 """Patterns that all channels may have alike: in the sky itself, but skies of a model have none of them."""
@@ -36,7 +35,8 @@ INDICES = (-3.0, -2.0, 1.5)
 class Structure:
     """One structure of the grammar."""
 
-    stage: str  #: "added", "gain", "beam", "square", "rotation", "noise", "power" or "modulation"
+    #: "added", "gain", "elsewhere", "beam", "square", "cube", "rotation", "noise", "power" or "modulation"
+    stage: str
     acts_on: str  #: what it multiplies: "sky", "dipole", "sky and dipole", or "" if nothing
     frame: str  #: "sky", "scan", "spacecraft", "time", or "" for noise and for the sky's own power
     #: what varies: "monopole", "degrees 0-2", "latitude ecliptic", "order 2", "year", "spin 1", "constant", ...
@@ -66,6 +66,14 @@ class Structure:
         """Return True if another says the same, but for a profile, the highest degree or the power of the frequency."""
         mine, theirs = ((*one.says[:3], *_briefly(one.kind), *one.says[4:6]) for one in (self, other))
         return mine == theirs
+
+    def extends(self, other: "Structure") -> bool:
+        """Return True for a function of time that has more than its constant, if that is the other one."""
+        if self.kind != "elongation" and not self.kind.endswith(ANY):
+            return False
+        same = (self.acts_on, self.channel, self.split, self.index)
+        constant = "constant" if self.stage == "gain" else "monopole"
+        return other.kind == constant and (other.acts_on, other.channel, other.split, other.index) == same
 
     @property
     def by_coordinate(self) -> bool:
@@ -113,14 +121,8 @@ def _rows(scene: Scene, keys: Sequence[Key], views: Sequence[int]) -> NDArray[np
 
 
 def _of_channels(scene: Scene) -> Iterator[Structure]:
-    """Yield the structures of a channel's noise, and of its power that is common to splits."""
-    _, ecliptic = _latitudes(scene.frame, 2)[0]
+    """Yield the spectrum of a channel's noise, and its power that is common to splits."""
     for c, name in enumerate(scene.channels):
-        keys: list[Key] = [("noise", c, j) for j in range(9)]
-        rows = np.array([[scene.place[key]] for key in keys])
-        mixes = {"level": np.eye(9)[:1], "latitude ecliptic": ecliptic[[0, 2]], "degrees 0-2": np.eye(9)}
-        for kind, mix in mixes.items():
-            yield Structure("noise", "", "", kind, name, ALIKE, None, rows, np.ones(1), mix)
         if len(scene.of(c)) > 1:
             ranges = range(len(scene.fine) - 1)
             yield _plain(scene, "noise", "", "spectrum", name, [("difference", c, b) for b in ranges])
@@ -165,13 +167,20 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
     """Yield stage, what it acts on, frame, kind, keys without the map, and mix."""
     view = scene.views[kept[0]]
     yield from _added(scene)
-    for s in range(1, len(view.w[:ORDERS]) + 1):
-        yield "added", "", "spacecraft", f"orientation {s}", [("orientation", s, c) for c in (0, 1)], None
     lobe: list[Key] = [("lobe", 0), ("lobe", 1), ("dipole",)]
     yield "added", "dipole", "spacecraft", "lobe", lobe, None
-    for name, line in _other_lines(scene, kept):
-        yield "added", "dipole", "spacecraft", f"line {name}", lobe, line
-    yield from _timed(scene)
+    for name in view.elsewhere:
+        if all(name in scene.views[i].elsewhere for i in kept):
+            for on in ACTED_ON[:2]:
+                yield "elsewhere", on, "spacecraft", name, [("elsewhere", name, on)], None
+            if name.startswith("line"):
+                yield "added", "dipole", "spacecraft", name, lobe, scene.elsewhere[view.channel][name][None]
+    for on in ("", *ACTED_ON) if split == ALIKE else ("",):
+        yield from _timed(scene, view, on)
+    noise: list[Key] = [("noise", j) for j in range(9)]
+    yield "noise", "", "", "level", noise[:1], None
+    yield "noise", "", "", "latitude ecliptic", noise, _latitudes(scene.frame, 2)[0][1][[0, 2]]
+    yield "noise", "", "", "degrees 0-2", noise, None
     yield "gain", "sky and dipole", "", "constant", [("gain", 0)], None
     for s in range(min(scene.split_orders, len(view.w)) + 1):
         for kind, mix in _profiles(scene, s):
@@ -188,42 +197,34 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
         for kind, zonal in _latitudes(scene.frame, top):
             yield "gain", acts_on, "sky", kind, [(key, j) for j in range((top + 1) ** 2)], zonal
     yield "gain", "dipole", "", "constant", [("dipole",)], None
-    for name in GAIN_WAVES if view.waves else ():
-        yield "gain", "sky and dipole", "time", name, [("gain wave", name, c) for c in (0, 1)], None
     yield "square", "sky and dipole", "", "square", [("square",)], None
     yield "square", "sky", "", "square", [("square of the sky",)], None
     yield "cube", "sky and dipole", "", "cube", [("cube",)], None
     yield "rotation", "sky and dipole", "sky", "rotation", [("rotation", axis) for axis in range(3)], None
 
 
-def _timed(scene: Scene) -> Iterator[_Form]:
-    """Yield what is added to samples and depends on time, where the pointing is known.
+def _timed(scene: Scene, view: View, on: str) -> Iterator[_Form]:
+    """Yield what follows time or orientation, where these are known: added to samples, or times what it acts on.
 
     The Sun is at azimuth 0 about the spin axis, and at a fixed distance from it: its distance from the line of sight is
     an even function of the spin phase.
     """
-    if not scene.timed:
+    stage = "gain" if on else "added"
+    waves: dict[str, list[Key]] = {name: [(on, name, c) for c in range(len(own))] for name, own in view.waves.items()}
+    for name, keys in waves.items():
+        wave, _, harmonic = name.partition(" ")
+        if wave != "Sun" and int(harmonic or 1) <= HARMONICS:
+            yield stage, on, "spacecraft" if wave == "orientation" else "time", name, keys, None
+    if not scene.timed or on in ACTED_ON[1:]:
         return
-    spins: list[Key] = [("wave", f"spin {k}", c) for k in range(1, SPIN + 1) for c in (0, 1)]
-    for k in range(SPIN):
-        yield "added", "", "time", f"spin {k + 1}", spins[2 * k : 2 * k + 2], None
-    yield "added", "", "time", f"spin 1-{SPIN}", [("added", 0), *spins], None
-    yield "added", "", "time", "year", [("wave", "year", c) for c in (0, 1)], None
-    yield "added", "", "Sun", "dipole", [("wave", "Sun", c) for c in (0, 1)], None
-    cosines: list[Key] = [("wave", f"spin {k}", 0) for k in range(1, ELONGATION + 1)]
-    yield "added", "", "Sun", "elongation", [("added", 0), *cosines], None
-
-
-def _other_lines(scene: Scene, kept: list[int]) -> Iterator[tuple[str, Matrix]]:
-    """Yield the other channels with their lines of sight in the frame of the beam of one channel, shape (1, 3)."""
-    channels = {scene.views[i].channel for i in kept}
-    if len(channels) > 1 or not scene.timed:
-        return
-    (own,) = channels
-    outward, south, east = (one[:, 0] for one in axes(*np.deg2rad(scene.lines[own])[:, None]))
-    for name, line in zip(scene.channels, scene.lines, strict=True):
-        if line != scene.lines[own]:
-            yield name, (np.stack([east, -south, outward]) @ axes(*np.deg2rad(line)[:, None])[0]).T
+    constant: Key = ("gain" if on else "added", 0)
+    for wave in ("spin", "year"):
+        every = [key for k in range(1, HARMONICS + 1) for key in waves[f"{wave} {k}"]]
+        yield stage, on, "time", f"{wave} {ANY}", [constant, *every], None
+    if not on:
+        yield stage, "", "Sun", "dipole", waves["Sun"], None
+        cosines = [waves[f"spin {k}"][0] for k in range(1, ELONGATION + 1)]
+        yield stage, "", "Sun", "elongation", [constant, *cosines], None
 
 
 def _added(scene: Scene) -> Iterator[_Form]:

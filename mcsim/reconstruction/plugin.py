@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from mcsim.reconstruction.forms import FORMS, Form
-from mcsim.reconstruction.grammar import ALIKE, OPPOSITE, SPIN, Structure
-from mcsim.reconstruction.scores import Scene
+from mcsim.reconstruction.grammar import ALIKE, ANY, OPPOSITE, Structure
+from mcsim.reconstruction.scores import ELSEWHERE, Scene
 from mcsim.support.arrays import Vector
 
 CONSTANT = float(np.sqrt(4.0 * np.pi))  #: real coefficient of degree 0 of a map that is one everywhere
@@ -77,14 +77,14 @@ def _literal(value: Any) -> str:
 def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plugin | None:
     """Return the effect of a structure with fitted coordinates; None if no effect of the simulator can be like it.
 
-    These are powers of unknown patterns, beams that differ between splits, and what depends on time or orientation
-    where the pointing is not known.
+    These are powers of unknown patterns, beams, signals from elsewhere and noise that differ between splits, and what
+    depends on time or orientation where the pointing is not known.
     """
     made = _form(structure, theta, scene)
     if made is None:
         return None
     base, values = made
-    if base in ("AddedToSamples", "GainOverTime") and not scene.timed:
+    if base in ("AddedToSamples", "GainOverTime", "GainOfOne") and not scene.timed:
         return None
     common = structure.channel is None and len(scene.channels) > 1
     scope = {"scope": "common"} if common or base == "SkyPower" else {}
@@ -99,6 +99,7 @@ def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plug
 def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[str, Any]] | None:
     """Return the name of the form, and its class variables."""
     pattern, alike = _numbers(structure, theta), structure.split == ALIKE
+    acting: dict[str, Any]
     splits = {} if alike else {"splits": _factors(structure.split, scene.splits)}
     timed: dict[str, Any] = {"coefficients": pattern, **splits}
     if structure.frame in ("spacecraft", "time", "Sun"):
@@ -110,8 +111,15 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             return "AddedToSamples", {"wave": "sky", "coefficients": pattern, **splits}
         case "added", "spacecraft" | "time" | "Sun":
             return "AddedToSamples", timed
-        case "gain", "time":
+        case "gain", "time" | "spacecraft" if structure.acts_on == "sky and dipole":
             return "GainOverTime", timed
+        case "gain", "time" | "spacecraft":
+            return "GainOfOne", {"on_sky": structure.acts_on == "sky", **timed}
+        case "elsewhere", _ if alike:
+            channel = 0 if structure.channel is None else scene.channels.index(structure.channel)
+            towards = tuple(map(float, scene.elsewhere[channel][structure.kind]))
+            acting = {"towards": towards, "on_dipole": "dipole" in structure.acts_on}
+            return "Elsewhere", {"factor": float(theta[0]), "top": ELSEWHERE, **acting}
         case "gain", _ if not alike:
             return "GainOverTime", {"coefficients": (float(theta[0]) / CONSTANT,), **splits}
         case "gain", _:
@@ -124,15 +132,11 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             edges = scene.edges(max(order, 1))
             return "BeamOrder", {"order": order, "edges": edges, "top": scene.lmax, "values": values}
         case "square" | "cube", _:
-            power = 2 if structure.stage == "square" else 3
-            return "SignalPower", {
-                "factor": float(theta[0]),
-                "power": power,
-                "on_dipole": "dipole" in structure.acts_on,
-            }
+            acting = {"power": 2 if structure.stage == "square" else 3, "on_dipole": "dipole" in structure.acts_on}
+            return "SignalPower", {"factor": float(theta[0]), **acting}
         case "rotation", _:
             return "RotatedSky", {"rotation": tuple(map(float, theta))}
-        case "noise", _ if structure.kind != "spectrum":
+        case "noise", _ if structure.kind != "spectrum" and alike:
             return "NoisePattern", {"coefficients": pattern}
         case "power", _ if structure.kind != "power":
             return "AddedPattern", {"coefficients": pattern}
@@ -152,16 +156,14 @@ def _wave(structure: Structure) -> dict[str, Any]:
     wave, _, rest = structure.kind.partition(" ")
     if structure.frame == "Sun":
         return {"wave": "Sun"} if wave == "dipole" else {"wave": "spin", "harmonic": 0}
-    if structure.acts_on == "dipole":
+    if structure.stage == "added" and structure.acts_on == "dipole":
         return {"wave": "lobe"}
-    if not rest:
-        return {"wave": wave}
-    return {"wave": wave, "harmonic": 0 if "-" in rest else int(rest)}
+    return {"wave": wave, "harmonic": int(rest)} if rest.isdigit() else {"wave": wave, "harmonic": 0}
 
 
 def _numbers(structure: Structure, theta: Vector) -> tuple[float, ...]:
     """Return the real coefficients of a pattern."""
-    if structure.kind in ("elongation", f"spin 1-{SPIN}"):  # from the constant on, which has no sine
+    if structure.kind == "elongation" or structure.kind.endswith(ANY):  # from the constant on, which has no sine
         cosines = np.stack([theta, np.zeros_like(theta)], axis=1).ravel()
         waves = cosines if structure.kind == "elongation" else np.insert(theta, 1, 0.0)
         return (float(waves[0]) / CONSTANT, *map(float, waves[1:]))

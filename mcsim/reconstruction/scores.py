@@ -5,7 +5,7 @@ the derivative of the log-likelihood in its amplitude. Structures that act on th
 sky. Scores of variances and powers are such derivatives too.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -13,6 +13,7 @@ from itertools import pairwise
 import healpy
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 
 from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.reconstruction.forms import boosts, rotations
@@ -26,8 +27,10 @@ ADDED, GAIN = 8, 4  #: highest degree of patterns that are added, and of those t
 ORDERS = 4  #: highest order of a beam, and of what follows its orientation
 MODULATION = 2  #: highest degree of patterns that multiply the sky itself
 ELONGATION = 6  #: highest harmonic of the spin phase in what depends on the distance from the Sun
-GAIN_WAVES = ("spin 1", "spin 2", "year")  #: waves that a gain may follow
+HARMONICS = 4  #: highest harmonic of spin phase, year and orientation that is said by itself
 BINS = 4  #: ranges of degrees of a profile in l, equal in log l
+ACTED_ON = ("sky and dipole", "sky", "dipole")  #: what a wave multiplies, if it is not added
+ELSEWHERE = 32  #: highest degree of a signal from elsewhere: a lobe has as many orders, and what is finer averages out
 
 Key = tuple[str | int, ...]
 
@@ -40,8 +43,11 @@ class View:
     channel: int
     split: int
     w: NDArray[np.complex128]  #: orientation moments, shape (smax, npix)
-    #: means over the samples of every pixel of what follows time: cosine and sine of waves, and so on, by their names
+    #: means over the samples of every pixel of what follows time or orientation: cosine and sine, and so on, by name
     waves: Mapping[str, tuple[Map, ...]]
+    #: means over the samples of every coarse pixel of what they see elsewhere, shape (pixels, pixels), by name
+    elsewhere: Mapping[str, csr_matrix]
+    precision: Map  #: one over the variance of the noise
     response: Cl  #: B_l w_l of the channel, shape (lmax + 1,)
     kernel: Cl  #: b_l0 of its beam, shape (lmax + 1,)
 
@@ -64,14 +70,14 @@ class Scene:
     sky_power: Cl
     split_orders: int  #: highest order of a beam that is measured in each map by itself
     views: tuple[View, ...]  #: maps, channel by channel
-    #: boresight angle and azimuth of each channel, degrees, if it is known when and how every sample was pointed, and
-    #: splits are spans of time; else none
-    lines: tuple[tuple[float, float], ...]
+    #: directions elsewhere in the frame of each channel's beam (x, y, outward), by what is there, if it is known when
+    #: and how every sample was pointed, and splits are spans of time; else none
+    elsewhere: tuple[Mapping[str, Vector], ...]
 
     @property
     def timed(self) -> bool:
         """Return True if the pointing of every sample is known."""
-        return bool(self.lines)
+        return bool(self.elsewhere)
 
     @property
     def degree(self) -> int:
@@ -105,24 +111,17 @@ class Scene:
             found += [("added", i, j) for j in range((self.degree + 1) ** 2)]
             for kind in ("gain of the sky", "gain"):
                 found += [(kind, i, j) for j in range((min(GAIN, self.lmax) + 1) ** 2)]
-            found += [
-                ("dipole", i),
-                ("square of the sky", i),
-                ("square", i),
-                ("cube", i),
-                ("lobe", i, 0),
-                ("lobe", i, 1),
-            ]
-            found += [("rotation", i, axis) for axis in range(3)]
-            found += [("orientation", i, s, c) for s in range(1, len(view.w[:ORDERS]) + 1) for c in (0, 1)]
-            found += [("wave", i, name, c) for name, maps in view.waves.items() for c in range(len(maps))]
-            found += [("gain wave", i, name, c) for name in GAIN_WAVES if name in view.waves for c in (0, 1)]
+            found += [(kind, i) for kind in ("dipole", "square of the sky", "square", "cube")]
+            found += [("lobe", i, 0), ("lobe", i, 1), *(("rotation", i, axis) for axis in range(3))]
+            every = [(name, c) for name, maps in view.waves.items() for c in range(len(maps))]
+            found += [(on, i, name, c) for on in ("", *ACTED_ON) for name, c in every]
+            found += [("elsewhere", i, name, on) for name in view.elsewhere for on in ACTED_ON[:2]]
+            found += [("noise", i, j) for j in range(9)]
             for s in range(min(ORDERS, len(view.w)) + 1):
                 if s <= self.split_orders or i == self.of(view.channel)[0]:
                     ranges = range(len(self.edges(max(s, 1))) - 1)
                     found += [("beam", i, s, b, c) for b in ranges for c in ((0, 1) if s else (0,))]
         for channel in range(len(self.channels)):
-            found += [("noise", channel, j) for j in range(9)]
             if len(self.of(channel)) > 1:
                 found += [(kind, channel, b) for kind in ("difference", "common") for b in range(len(self.fine) - 1)]
         found += [("power", b) for b in range(len(self.fine) - 1)]
@@ -140,11 +139,8 @@ class Scene:
         n = healpy.pix2vec(self.nside, np.arange(12 * self.nside**2))
         return np.stack([real.field(unit, *n) for unit in np.eye((GAIN + 1) ** 2)])
 
-    def values(self, filtered: FilteredMaps, differences: Sequence[Map]) -> Vector:
-        """Return the scores, shape (len(keys),).
-
-        ``differences`` are u^2 - 1 of every pixel and channel, u the difference of its maps over the noise.
-        """
+    def values(self, filtered: FilteredMaps) -> Vector:
+        """Return the scores, shape (len(keys),)."""
         found: list[NDArray[np.float64]] = []
         looked_at = filtered.sky + dipole_alm(self.dipole_uk, self.lmax)
         turned = rotations(looked_at, self.lmax)
@@ -157,13 +153,15 @@ class Scene:
             found.append(np.array([r @ self.dipole, r @ sky**2, r @ whole**2, r @ whole**3, *self._lobe(r, view)]))
             through = (alm_.multiply(one, view.response, self.lmax) for one in turned)
             found.append(np.array([_product(adjoint, one, self.lmax) for one in through]))
-            found += [np.array([r @ w.real, -(r @ w.imag)]) for w in view.w[:ORDERS]]
-            found += [np.array([r @ one for one in maps]) for maps in view.waves.values()]
-            gained = (view.waves[name] for name in GAIN_WAVES if name in view.waves)
-            found += [np.array([(r * whole) @ one for one in maps]) for maps in gained]
+            every = [one for maps in view.waves.values() for one in maps]
+            found += [np.array([field @ one for one in every]) for field in (r, r * whole)]
+            lost = self._leak(adjoint) * sky
+            found += [np.array([(r * sky - lost) @ one for one in every])]
+            found += [np.array([(r * self.dipole) @ one for one in every])]
+            found += self._elsewhere(r, filtered.sky, view)
+            found.append(0.5 * self._patterns[:9] @ divided(r**2, view.precision))
             found += list(self._orders(view, filtered.orders[i], i))
-        for channel, difference in enumerate(differences):
-            found.append(0.5 * self._patterns[:9] @ difference)
+        for channel in range(len(self.channels)):
             if len(own := self.of(channel)) > 1:
                 a, b = filtered.adjoint[own[0]], filtered.adjoint[own[1]]
                 found += [self._powers(a - b, a - b), self._powers(a, b)]
@@ -187,9 +185,23 @@ class Scene:
         The model's sky has none, so that they would be most of the score, and follow few modes of this very sky.
         """
         patterns = self._patterns[: (top + 1) ** 2]
-        area = 4.0 * np.pi / sky.size
-        leaks = area * (patterns * sky) @ self._patterns[:4].T
-        return _low(r * sky, top) - leaks @ real.coefficients(adjoint, self.lmax, 1)
+        return _low(r * sky, top) - patterns @ (self._leak(adjoint) * sky)
+
+    def _leak(self, adjoint: Alm) -> Map:
+        """Return the map whose product with a map is the score of the monopole and dipole of that."""
+        low = real.coefficients(adjoint, self.lmax, 1) @ self._patterns[:4]
+        return np.asarray(4.0 * np.pi / low.size * low)
+
+    def _elsewhere(self, r: Map, sky: Alm, view: View) -> list[Vector]:
+        """Return the scores of sky and dipole, and of the sky alone, in the directions of samples elsewhere."""
+        if not view.elsewhere:
+            return []
+        top, nside = min(ELSEWHERE, self.lmax), coarse(self.nside)
+        seen = alm_.resize(alm_.multiply(sky, view.response, self.lmax), self.lmax, top)
+        alone = healpix.synthesis(seen[None], nside, top)[0]
+        whole = alone + self.dipole_uk @ np.stack(healpy.pix2vec(nside, np.arange(12 * nside**2)))
+        summed = healpy.ud_grade(r, nside, power=-2)
+        return [np.array([summed @ (one @ whole), summed @ (one @ alone)]) for one in view.elsewhere.values()]
 
     def _orders(self, view: View, orders: NDArray[np.complex128], i: int) -> list[Vector]:
         ell, found = np.arange(self.lmax + 1), []
@@ -227,6 +239,11 @@ class Scene:
                 [_product(expected, moved, self.lmax) for moved in boosts(sky, self.lmax)],
             ]
         )
+
+
+def coarse(nside: int) -> int:
+    """Return the nside of the pixels of what is seen elsewhere."""
+    return min(nside, ELSEWHERE // 2)
 
 
 def _low(product: Map, top: int) -> Vector:

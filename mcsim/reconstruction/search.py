@@ -29,7 +29,8 @@ FINALISTS, NEAR, SPARE = 14, 5.0, 2
 the evidence those of one stage and frame, and simulations for each of their scores."""
 
 RARE = 3.0
-"""Odds against a structure that differs between splits, a gain or square of sky or dipole alone, a cube, a halo."""
+"""Odds against a structure that differs between splits, acts on sky or dipole alone, a cube, a halo, and of a function
+of time beside its constant, of which there are several."""
 
 TAIL = 0.1  #: share of the simulations by which the tail of the largest evidence is described
 SMALL = 1e-6  #: variance, relative to the largest, of a direction in which scores are not inverted
@@ -84,21 +85,24 @@ class Search:
         spread = rows.std(axis=0)
         if not np.all(spread > 1e-12 * max(float(np.abs(rows).max()), 1e-300)) or rows.shape[1] + 10 > len(rows):
             return None
-        return SimulatedGaussian.from_simulations(rows)
+        mean = rows.mean(axis=0)  # not by from_simulations, which tests the covariance, too, at 20 times the cost
+        _, size, axes = np.linalg.svd((rows - mean) / spread, full_matrices=False)
+        kept = size > 1e-4 * size[0]
+        whitening = np.sqrt(len(rows) - 1.0) * axes[kept] / size[kept, None] / spread
+        return SimulatedGaussian(mean, whitening, len(rows))
 
     @cached_property
     def largest(self) -> Vector:
         """Return the largest evidence over the grammar of every simulation against all others, shape (N,)."""
-        count, best = len(self.simulations), np.full(len(self.simulations), -np.inf)
-        for structure, null in zip(self.grammar, self.nulls, strict=True):
+        count, falls = len(self.simulations), np.full((len(self.grammar), len(self.simulations)), np.nan)
+        for row, (structure, null) in enumerate(zip(self.grammar, self.nulls, strict=True)):
             if null is None:
                 continue
             white = (structure.of(self.simulations) - null.mean) @ null.whitening.T
             a = np.sum(white**2, axis=1) / null.dof * count / (count - 1)
             square = (null.dof - 1) * a / np.maximum(1.0 - a, 1e-12)
-            fall = square * (null.dof - null.dimension - 2) / (null.dof - 1)
-            best = np.maximum(best, evidence(fall, null.dimension) - _rarity(structure))
-        return best
+            falls[row] = square * (null.dof - null.dimension - 2) / (null.dof - 1)
+        return np.asarray(self._evidences(falls, range(len(self.grammar))).max(axis=0))
 
     def pvalue(self, value: float) -> float:
         """Return the global p-value of an evidence: by rank, beyond the last TAIL of simulations exponential.
@@ -147,16 +151,38 @@ class Search:
             chosen = [one.structure for one in found]
             if sky is not None:
                 sky.keep(members[best], amplitudes[best])
-            rest = self.regressed(chosen, scores) if sky is None else sky.left(chosen)
+            rest = rest - amplitudes[best] @ responses[best] if sky is None else sky.left(chosen)
         return found
 
     def evidences(self, scores: Vector) -> Vector:
         """Return the evidence of every structure by itself, less the logarithm of the odds against such ones."""
-        found = [
-            -np.inf if null is None else float(evidence(np.array(fall), null.dimension)) - _rarity(structure)
-            for structure, null, fall in zip(self.grammar, self.nulls, self._falls(scores), strict=True)
-        ]
-        return np.array(found)
+        return self._evidences(self._falls(scores)[:, None], range(len(self.grammar)))[:, 0]
+
+    @cached_property
+    def constants(self) -> dict[int, int]:
+        """Return the structure that is the constant of a function of time, which is measured by itself."""
+        longer = [k for k, one in enumerate(self.grammar) if any(map(one.extends, self.grammar))]
+        first = {k: next(j for j, one in enumerate(self.grammar) if self.grammar[k].extends(one)) for k in longer}
+        return {k: j for k, j in first.items() if self.nulls[j] is not None and self.nulls[k] is not None}
+
+    def _evidences(self, falls: NDArray[np.float64], members: Sequence[int]) -> NDArray[np.float64]:
+        """Return evidences from the falls of chi^2 of members, shape (members, n); not measured: NaN, and -inf.
+
+        What a function of time is beyond its constant has a size of its own: most of a pulse is its mean, a monopole.
+        That the covariance is estimated makes a fall beside a larger one, T, larger by 1 + T/N on average (Rao, Linear
+        Statistical Inference, 8c.4).
+        """
+        place, found = {k: row for row, k in enumerate(members)}, np.full(falls.shape, -np.inf)
+        for row, k in enumerate(members):
+            structure, constant = self.grammar[k], place.get(self.constants.get(k, -1))
+            if self.nulls[k] is None:
+                continue
+            found[row] = evidence(falls[row], structure.size) - _rarity(structure)
+            if constant is not None:
+                more = (falls[row] - falls[constant]) / (1.0 + np.maximum(falls[constant], 0.0) / len(self.simulations))
+                found[row] = evidence(falls[constant], 1) + evidence(more, structure.size - 1) - np.log(RARE)
+                found[row] -= _rarity(structure)
+        return found
 
     def finalists(self, values: Vector) -> list[int]:
         """Return structures to compare: the most evident one, and those that may be it on this sky.
@@ -173,6 +199,7 @@ class Search:
         if each[0].stage == "power":  # a monopole or dipole may be made of the rest of the sky
             made = (k for k, one in enumerate(self.grammar) if one.stage == "modulation")
             wanted += [k for k in made if self.nulls[k] is not None]
+        wanted += [self.constants[k] for k in order[:1] if k in self.constants]
         wanted += _firsts(order, [one.stage for one in each])
         wanted += [k for k in order if each[0].elsewhere(self.grammar[k]) or each[0].like(self.grammar[k])]
         wanted += [k for k in order if values[order[0]] - values[k] < NEAR]
@@ -195,9 +222,7 @@ class Search:
         x = self._rows(members, scores)
         fits = [null.fit(x, self._rows(members, one).T) for one in responses]
         falls = null.hartlap_factor * np.array([one.delta_chi2 for one in fits])
-        each = [self.grammar[k] for k in members]
-        odds = [float(evidence(fall, w.size)) - _rarity(w) for fall, w in zip(falls, each, strict=True)]
-        return np.array(odds), falls, [one.amplitudes for one in fits]
+        return self._evidences(falls[:, None], members)[:, 0], falls, [one.amplitudes for one in fits]
 
     def mean_responses(self, members: Sequence[int], scores: Vector) -> list[Matrix]:
         """Return the response of all scores to each structure as it is fitted, on average over skies, (1, P) each."""
@@ -212,15 +237,6 @@ class Search:
         """Return the unbiased fall of chi^2 of every structure by itself."""
         pairs = zip(self.grammar, self.nulls, strict=True)
         return np.array([0.0 if n is None else n.hartlap_factor * n.chi2(w.of(scores)) for w, n in pairs])
-
-    def regressed(self, chosen: Sequence[int], scores: Vector) -> Vector:
-        """Return what the regression of all scores on those of chosen structures leaves."""
-        rows = self._rows(chosen, self.simulations)
-        null = SimulatedGaussian.from_simulations(rows, floor=SMALL)
-        white = null.whitening.T
-        slopes = (rows - null.mean) @ white @ white.T
-        slopes = slopes.T @ (self.simulations - self.simulations.mean(axis=0)) / null.dof
-        return np.asarray(scores - (self._rows(chosen, scores) - null.mean) @ slopes)
 
     def fit(self, chosen: Sequence[Structure], scores: Vector) -> list[tuple[Vector, Matrix]]:
         """Return the coordinates of structures, fitted together, and the covariance of each.
@@ -251,7 +267,7 @@ def _firsts(order: Sequence[int], labels: Sequence[Hashable]) -> list[int]:
 
 def _rarity(structure: Structure) -> float:
     """Return the logarithm of the prior odds against a structure, beside one of the common kind."""
-    part = structure.stage in ("gain", "square") and structure.acts_on != "sky and dipole"
+    part = structure.stage in ("gain", "square", "elsewhere") and structure.acts_on != "sky and dipole"
     rare = (structure.split != ALIKE) + (part or structure.stage == "cube" or structure.kind.endswith("low l"))
     return rare * float(np.log(RARE))
 

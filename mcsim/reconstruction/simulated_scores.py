@@ -2,25 +2,32 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import healpy
 import numpy as np
+from scipy.sparse import csr_matrix, diags
 
 from mcsim import config
 from mcsim.datavector.analysis import Analysis, Job, Kinds, analysis_for, simulated_maps
 from mcsim.datavector.campaign import Ask, seeded
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import Model, wiener_filter
+from mcsim.instrument.scan import MapGrid
+from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.reconstruction.forms import AddedToSamples
-from mcsim.reconstruction.scores import ELONGATION, Scene, View
+from mcsim.reconstruction.scores import ELONGATION, HARMONICS, ORDERS, Scene, View, coarse
 from mcsim.simulation.pixel_means import signal_of
+from mcsim.simulation.tod import samples
 from mcsim.support import folders
-from mcsim.support.arrays import Map, Matrix, Vector
+from mcsim.support.arrays import Map, Matrix, Vector, divided
 from mcsim.support.code import package_digest
+from mcsim.systematics import Pointing
+from mcsim.systematics.spacecraft import axes
 
 SIMULATIONS = 400
 """Of the model, for mean and covariance of the scores: as many realizations more, once for each model."""
@@ -31,10 +38,14 @@ PER_TASK = 10
 
 WAVES: dict[str, dict[str, Any]] = {
     **{f"spin {k}": {"wave": "spin", "harmonic": k} for k in range(1, ELONGATION + 1)},
-    "year": {"wave": "year"},
+    **{f"year {k}": {"wave": "year", "harmonic": k} for k in range(1, HARMONICS + 1)},
+    "trend": {"wave": "trend"},
     "Sun": {"wave": "Sun"},
 }
-"""What follows time, of two components each, by name: class variables of a form."""
+"""What follows time, of two components each but for the trend, by name: class variables of a form."""
+
+LAGS = {"-1/8": -0.125, "+1/8": 0.125, "-1/4": -0.25, "+1/4": 0.25, "1/2": 0.5}  #: turns of the spin after a sample
+SAMPLES = 200_000  #: of a map, about, by which directions elsewhere are known
 
 CODE = (
     *("config", "sphere", "instrument", "systematics", "simulation", "reconstruction.forms", "reconstruction.scores"),
@@ -51,19 +62,23 @@ def scene_of(model: Model) -> Scene:
     timed = run.map.split_by == "time" and all(site.pointing is not None for site in sites)
     pointed = [site.pointed("a wave").line for site in sites] if timed else []
     lines = tuple((line.boresight_angle_deg, line.azimuth_deg) for line in pointed)
+    elsewhere = [directions(own, dict(zip(model.channels, lines, strict=True))) for own in lines]
     views = []
     for i, part in enumerate(model.parts):
         channel = model.survey.channels[part.channel]
         split = model.of(part.channel).index(i)
         waves: dict[str, tuple[Map, ...]] = {}
         for name, values in WAVES.items() if timed else ():
-            acting = [_wave(*values.items(), component=c)(amplitude=1.0) for c in (0, 1)]
-            means = (signal_of(one, channel.site, run.map.span(split)) for one in acting)
-            waves[name] = tuple(np.where(part.precision > 0, one, 0.0) for one in means)
+            acting = [_wave(*values.items(), component=c)(amplitude=1.0) for c in range(1 if name == "trend" else 2)]
+            waves[name] = tuple(signal_of(one, channel.site, run.map.span(split)) for one in acting)
         kernel = channel.site.beam.blm[0, : model.lmax + 1].real
         measured = part.moments.w[: model.settings.beam_orders]
         moments = np.where(np.isfinite(measured), measured, 0.0)
-        views.append(View(part.channel, split, moments, waves, model.response[part.channel], kernel))
+        waves |= {f"orientation {s + 1}": (w.real, -w.imag) for s, w in enumerate(moments[:ORDERS])}
+        grid = MapGrid(model.nside, model.frame, run.map.span(split))
+        seen = _elsewhere(channel.site.pointed("elsewhere"), grid, elsewhere[part.channel]) if timed else {}
+        response = model.response[part.channel]
+        views.append(View(part.channel, split, moments, waves, seen, part.precision, response, kernel))
     return Scene(
         channels=model.channels,
         frequencies=tuple(channel.site.frequency_ghz for channel in model.survey.channels),
@@ -76,8 +91,39 @@ def scene_of(model: Model) -> Scene:
         sky_power=model.sky_power,
         split_orders=model.settings.split_beam_orders,
         views=tuple(views),
-        lines=lines,
+        elsewhere=tuple(elsewhere),
     )
+
+
+def directions(own: tuple[float, float], lines: Mapping[str, tuple[float, float]]) -> dict[str, Vector]:
+    """Return unit vectors in the frame of a beam (its x and y, outward), shape (3,), by what is there.
+
+    ``own`` and ``lines`` are boresight angle and azimuth, degrees: of the beam, and of other channels.
+    """
+    found = {f"line {name}": line for name, line in lines.items() if line != own}
+    found |= {f"spin {name}": (own[0], own[1] + 360.0 * turns) for name, turns in LAGS.items()}
+    outward, south, east = (one[:, 0] for one in axes(*np.deg2rad(own)[:, None]))
+    frame = np.stack([east, -south, outward])
+    seen = {name: frame @ axes(*np.deg2rad(line)[:, None])[0][:, 0] for name, line in found.items()}
+    return seen | {"opposite": np.array([0.0, 0.0, -1.0])}
+
+
+def _elsewhere(pointing: Pointing, grid: MapGrid, wanted: Mapping[str, Vector]) -> dict[str, csr_matrix]:
+    """Return the mean over the samples of every coarse pixel of what a map has in other directions."""
+    period = pointing.model.duration_days * SECONDS_PER_DAY * np.ptp(grid.time_range) / SAMPLES
+    model, line = pointing.model, pointing.line
+    if period > model.period_of_samples(line):
+        model, line = model.with_sampling(period), replace(line, sample_period_s=None)
+    nside = coarse(grid.nside)
+    total = {name: csr_matrix((12 * nside**2, 12 * nside**2)) for name in wanted}
+    for chunk in samples(model, line, replace(grid, nside=nside)):
+        outward, south, east = axes(chunk.theta, chunk.phi)
+        x, y = (np.cos(a) * south + np.sin(a) * east for a in (chunk.psi, chunk.psi + 0.5 * np.pi))
+        for name, (a, b, c) in wanted.items():
+            there = healpy.vec2pix(nside, *(a * x + b * y + c * outward))
+            total[name] += csr_matrix((np.ones(len(there)), (chunk.pixel, there)), total[name].shape)
+    hits = next(iter(total.values())).sum(axis=1).A1
+    return {name: diags(divided(1.0, hits)) @ one for name, one in total.items()}
 
 
 @lru_cache(maxsize=64)
@@ -91,7 +137,7 @@ def _wave(*values: tuple[str, Any], component: int) -> type[AddedToSamples]:
 def scores_of_maps(model: Model, scene: Scene, maps: Sequence[Map]) -> Vector:
     """Return the scores of the grammar, shape (P,)."""
     filtered = wiener_filter(model, maps)
-    return scene.values(filtered, list(filtered.difference))
+    return scene.values(filtered)
 
 
 def scores(job: Job) -> Matrix:

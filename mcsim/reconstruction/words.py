@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from mcsim.reconstruction.grammar import ALIKE, OPPOSITE, Structure
+from mcsim.reconstruction.grammar import ALIKE, ANY, OPPOSITE, Structure
 from mcsim.reconstruction.scores import Scene
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import Library
@@ -12,39 +12,28 @@ from mcsim.systematics.base import scan_direction
 
 _DERIVATIVES = {2: "second derivative", 3: "third derivative", 4: "fourth derivative"}
 
-_LIKE: tuple[tuple[tuple[str, str, str], str], ...] = (
-    (("beam", "scan", "order 0 at low l"), "beam_sidelobe"),
-    (("beam", "scan", "order 0"), "beam_width"),
-    (("beam", "scan", "order 1"), "pointing_offset"),
-    (("beam", "scan", "order 2"), "beam_ellipticity"),
-    (("beam", "scan", "order 3"), "beam_coma"),
-    (("gain", "time", "year"), "gain_drift"),
-    (("gain", "time", "spin"), "gain_spin"),
-    (("gain", "", "constant"), "calibration"),
-    (("added", "time", "spin"), "spin_synchronous_offset"),
-    (("added", "spacecraft", ""), "sidelobe_pickup"),
-    (("added", "Sun", "dipole"), "orbital_dipole"),
-    (("added", "sky", "dipole"), "dipole_residual"),
-    (("added", "sky", "monopole"), "monopole_residual"),
-    (("added", "sky", "latitude galactic"), "foreground_residual"),
-    (("square", "", ""), "nonlinearity"),
-    (("cube", "", ""), "nonlinearity"),
-    (("noise", "", "latitude"), "noise_anisotropy"),
-    (("noise", "", "level"), "noise_level"),
-    (("power", "", "monopole"), "monopole_residual"),
-    (("power", "", "dipole"), "dipole_residual"),
-    (("power", "", "power"), "point_sources"),
-    (("modulation", "sky", "degree 1 as a boost"), "boost"),
-    (("modulation", "sky", "degree 1"), "dipole_modulation"),
-    (("modulation", "sky", "degree 2"), "quadrupole_modulation"),
-)
-"""Stage, frame and how the kind starts of structures that an effect of the library makes; the first that fits."""
+_LIKE: tuple[tuple[str, str, str, str], ...] = (
+    ("beam", "scan", "order 0 at low l", "beam_sidelobe"), ("beam", "scan", "order 0", "beam_width"),
+    ("beam", "scan", "order 1", "pointing_offset"), ("beam", "scan", "order 2", "beam_ellipticity"),
+    ("beam", "scan", "order 3", "beam_coma"), ("gain", "time", "year", "gain_drift"),
+    ("gain", "time", "spin", "gain_spin"), ("gain", "", "constant", "calibration"),
+    ("added", "time", "spin", "spin_synchronous_offset"), ("added", "spacecraft", "", "sidelobe_pickup"),
+    ("added", "Sun", "dipole", "orbital_dipole"), ("added", "sky", "dipole", "dipole_residual"),
+    ("added", "sky", "monopole", "monopole_residual"), ("added", "sky", "latitude galactic", "foreground_residual"),
+    ("square", "", "", "nonlinearity"), ("cube", "", "", "nonlinearity"),
+    ("noise", "", "latitude", "noise_anisotropy"), ("noise", "", "level", "noise_level"),
+    ("power", "", "monopole", "monopole_residual"), ("power", "", "dipole", "dipole_residual"),
+    ("power", "", "power", "point_sources"), ("modulation", "sky", "degree 1 as a boost", "boost"),
+    ("modulation", "sky", "degree 1", "dipole_modulation"),
+    ("modulation", "sky", "degree 2", "quadrupole_modulation"),
+)  # fmt: skip
+"""Stage, frame and how the kind starts of structures, and the effect of the library that makes such; the first fits."""
 
 
 def cause(structure: Structure, library: Library) -> str:
     """Return a known cause of such structures with its reference, or nothing."""
     name = "foreground_residual" if structure.index is not None else ""
-    for (stage, frame, kind), effect in _LIKE if not name else ():
+    for stage, frame, kind, effect in _LIKE if not name else ():
         if structure.stage == stage and structure.frame == frame and structure.kind.startswith(kind):
             name = effect
             break
@@ -74,10 +63,14 @@ def _what(structure: Structure, theta: Vector) -> str:
             return f"is added to the signal and depends on {SUN[kind]}"
         case "added", "spacecraft" if kind.startswith("line"):
             return f"is the dipole as the line of sight of {number} sees it at the same time"
+        case "elsewhere", _:
+            return f"has {on} as seen elsewhere: {_there(kind)}"
         case "added", "spacecraft":
             return f"is added to the signal, fixed to the spacecraft (order {number} in the orientation of the beam)"
         case "added", _:
             return f"is added to the signal and follows the {_wave(kind)}"
+        case "gain", "spacecraft":
+            return f"is proportional to {on}, and follows the orientation of the beam (order {number})"
         case "gain", "time":
             return f"is proportional to {on}, and follows the {_wave(kind)}"
         case "gain", "sky":
@@ -122,18 +115,23 @@ def _pattern(kind: str) -> str:
     return {"power": "pattern not known, by its power in ℓ"}.get(kind, kind)
 
 
+def _there(kind: str) -> str:
+    what, _, where = kind.partition(" ")
+    if what == "spin":
+        turns = f"{where.lstrip('+-')} of a spin"
+        return f"{turns} {'before' if where[0] == '-' else 'after'}" if where[0] in "+-" else f"{turns} away"
+    return f"along the line of sight of {where}" if what == "line" else "in the opposite direction"
+
+
 def _wave(kind: str) -> str:
     wave, _, harmonic = kind.partition(" ")
-    return "year" if wave == "year" else f"spin phase{_HARMONIC[harmonic]}"
+    if wave == "trend":
+        return "time, growing steadily"
+    often = {ANY: ", in any way", "1": ""}.get(harmonic, f", {_TIMES.get(harmonic)} a {wave}")
+    return ("year" if wave == "year" else "spin phase") + often
 
 
-_HARMONIC = {
-    "1": "",
-    "2": ", twice a spin",
-    "3": ", three times a spin",
-    "4": ", four times a spin",
-    "1-4": ", in any way",
-}
+_TIMES = {"2": "twice", "3": "three times", "4": "four times"}
 
 SUN = {
     "dipole": "the angles of the line of sight to the directions of the Sun and of the Earth's motion, as a dipole",

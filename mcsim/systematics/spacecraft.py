@@ -22,6 +22,25 @@ def spin_phase(pointing: Pointing, time_s: Vector) -> Vector:
     return np.asarray(2.0 * np.pi * (time_s / model.spin_period_s % 1.0) + np.deg2rad(start_deg))
 
 
+def orientation(pointing: Pointing, time_s: Vector, frame: str) -> Vector:
+    """Return psi of the beam at some times, radians; :class:`mcsim.instrument.scan.ScanModel` has the rotations."""
+    model, line, spin = pointing.model, pointing.line, spin_phase(pointing, time_s)
+    sin_b, cos_b = (f(np.deg2rad(line.boresight_angle_deg)) for f in (np.sin, np.cos))
+    beam = np.stack([sin_b * np.cos(spin), sin_b * np.sin(spin), np.full(spin.shape, cos_b)])
+    along = np.stack([-np.sin(spin), np.cos(spin), np.zeros(spin.shape)])
+    precession = 2.0 * np.pi * time_s / model.precession_period_s + np.deg2rad(model.precession_phase_deg)
+    orbit = 2.0 * np.pi * time_s / model.orbit_period_s + np.deg2rad(model.orbit_phase_deg)
+    for plane, angle in (
+        ((2, 0), np.deg2rad(model.precession_angle_deg)), ((0, 1), precession), ((2, 0), 0.5 * np.pi), ((0, 1), orbit)
+    ):  # fmt: skip
+        for one in (beam, along):
+            a, b = one[plane[0]].copy(), one[plane[1]].copy()
+            one[plane[0]], one[plane[1]] = np.cos(angle) * a - np.sin(angle) * b, np.sin(angle) * a + np.cos(angle) * b
+    beam, along = (rotation_matrix("ecliptic", frame) @ one for one in (beam, along))
+    _, south, east = axes(np.arctan2(np.hypot(beam[0], beam[1]), beam[2]), np.arctan2(beam[1], beam[0]))
+    return np.arctan2(np.sum(along * east, axis=0), np.sum(along * south, axis=0))
+
+
 ECCENTRICITY, PERIHELION_DEG = 0.0167, 102.9
 """Of the Earth's orbit in this century, the ecliptic longitude as seen from the Sun."""
 

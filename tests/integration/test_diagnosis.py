@@ -116,7 +116,7 @@ def test_an_unlisted_effect_is_described_written_and_shrinks(small, tmp_path, mo
     assert before.unlisted is None
     found = unlisted.reconstructed(before, data, lambda jobs: [simulated_scores.scores(job) for job in jobs])
     first = found.unlisted[0]
-    assert (first.stage, first.frame, first.kind, first.channel) == ("gain", "time", "year", "W1")
+    assert (first.stage, first.frame, first.kind, first.channel) == ("gain", "time", "year 1", "W1")
     assert first.pvalue < 1e-4
     assert "annual gain drift" in first.cause
     assert found.unlisted_held_out.achieved.value > 0.5
