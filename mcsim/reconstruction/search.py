@@ -29,8 +29,9 @@ FINALISTS, NEAR, SPARE = 14, 5.0, 2
 the evidence those of one stage and frame, and simulations for each of their scores."""
 
 RARE = 3.0
-"""Odds against a structure that differs between splits, acts on sky or dipole alone, a cube, a halo, and of a function
-of time beside its constant, of which there are several."""
+"""Odds against a structure that differs between splits, acts on sky or dipole alone, a cube, a halo, a signal from
+elsewhere (the dipole of the opposite direction is a gain's), and of a function of time beside its constant, of which
+there are several."""
 
 TAIL = 0.1  #: share of the simulations by which the tail of the largest evidence is described
 SMALL = 1e-6  #: variance, relative to the largest, of a direction in which scores are not inverted
@@ -268,7 +269,8 @@ def _firsts(order: Sequence[int], labels: Sequence[Hashable]) -> list[int]:
 def _rarity(structure: Structure) -> float:
     """Return the logarithm of the prior odds against a structure, beside one of the common kind."""
     part = structure.stage in ("gain", "square", "elsewhere") and structure.acts_on != "sky and dipole"
-    rare = (structure.split != ALIKE) + (part or structure.stage == "cube" or structure.kind.endswith("low l"))
+    odd = part or structure.stage == "cube" or structure.kind.endswith("low l")
+    rare = (structure.split != ALIKE) + odd + (structure.stage == "elsewhere")
     return rare * float(np.log(RARE))
 
 
