@@ -73,8 +73,9 @@ def test_a_constant_of_any_package_that_computes_is_learned_anew(plugin, monkeyp
 @pytest.mark.parametrize("field", fields(DiagnosisSettings), ids=lambda field: field.name)
 def test_every_setting_has_a_part_in_the_key(plugin, field):
     effect = importlib.import_module("effects_of_a_user").Tilt
-    other = replace(DiagnosisSettings(), **{field.name: another(getattr(DiagnosisSettings(), field.name))})
-    assert key(effect, other) != key(effect)
+    default = DiagnosisSettings()
+    value = {"beam_orders": 3, "beam_bins": (3, 2, 2, 1, 1)}.get(field.name, another(getattr(default, field.name)))
+    assert key(effect, replace(default, **{field.name: value})) != key(effect)
 
 
 def another(value):
