@@ -125,8 +125,8 @@ class Search:
 
         ``sky`` knows what structures do on the sky of the data, whose patterns make scores correlated that are
         independent on average over skies. It judges between the finalists, and takes out what is found before the rest
-        is searched; None: by averages over skies. What is left of a structure by one that says the same of fewer or more
-        degrees is its shape, and no further structure.
+        is searched; None: by averages over skies. What a structure leaves for one that is like it is its
+        shape, and no further structure.
         """
         found: list[Found] = []
         rest = scores
