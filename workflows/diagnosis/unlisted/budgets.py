@@ -21,6 +21,7 @@ from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotation_matrix
 from mcsim.sphere.sky import dipole_alm
+from mcsim.systematics.base import Site
 from mcsim.systematics.spacecraft import axes
 
 YEAR_S, DAY_S, FINE = 365.25 * 86400.0, 86400.0, 128
@@ -37,6 +38,7 @@ class Seen:
     n: np.ndarray
     away: float  # angle of the line of sight from the spin axis, radians
     sky: np.ndarray  # sky and dipole through the beam, on pixels of nside FINE
+    site: Site
 
     def at(self, n):
         """Return sky and dipole in directions, shape (3, n)."""
@@ -127,7 +129,7 @@ class Case:
 
     act: Callable[[Seen], np.ndarray]
     right: tuple[tuple[str, str, tuple[str, ...] | None, tuple[str, ...] | None], ...]
-    common: bool = False
+    common: Callable[[float], float] | None = None  # in both channels, by frequency in GHz; None: in one
 
 
 ALIKE = ("alike",)
@@ -143,7 +145,7 @@ CASES = (
     ),
     Case(solar_rotation, (("added", "time", ANY, ANY),)),
     Case(magnetic, (("gain", "spacecraft", ANY, ALIKE),)),
-    Case(zodiacal, (("added", "sky", ("latitude ecliptic",), ALIKE),), common=True),
+    Case(zodiacal, (("added", "sky", ("latitude ecliptic",), ALIKE),), common=lambda ghz: (ghz / 94.0) ** 1.5),
     Case(cosmic_rays, (("noise", "", ("level",), ("half2",)),)),
     Case(polarised, (("added", "spacecraft", ("orientation 2",), ALIKE), ("added", "sky", ("orientation 2",), ALIKE))),
     Case(transponder, (("gain", "", ("constant",), ALIKE), ("gain", "time", ANY, ALIKE))),
@@ -169,12 +171,12 @@ class Sky:
         for c in channels:
             site = self.survey.channels[c].site
             pointing, away = site.pointing, np.deg2rad(site.pointing.line.boresight_angle_deg)
-            scale = (site.frequency_ghz / 94.0) ** 1.5 if case.common else 1.0
+            scale = case.common(site.frequency_ghz) if case.common else 1.0
 
-            def signal(chunk, away=away, scale=scale):
+            def signal(chunk, away=away, scale=scale, site=site):
                 n, south, east = axes(chunk.theta, chunk.phi)
                 x, y = (np.cos(a) * south + np.sin(a) * east for a in (chunk.psi, chunk.psi + 0.5 * np.pi))
-                return scale * case.act(Seen(chunk.time_s, chunk.psi, x, y, n, away, self.fine))
+                return scale * case.act(Seen(chunk.time_s, chunk.psi, x, y, n, away, self.fine, site))
 
             for k in range(2):
                 grid = MapGrid(self.survey.nside, site.frame, self.run.map.span(k))
@@ -187,10 +189,10 @@ class Sky:
         return change
 
 
-def main(span="0:24"):
-    """Scale each case to an S/N of the data vector, and print what is said of it."""
+def main(span="0:24", cases=CASES, first=95_000):
+    """Scale each of twelve cases to an S/N of the data vector, and print what is said of it."""
     for number in range(24)[slice(*map(int, span.split(":")))]:
-        case, wanted, sky = CASES[number % 12], (10.0, 20.0)[number // 12], Sky(95_000 + number)
+        case, wanted, sky = cases[number % 12], (10.0, 20.0)[number // 12], Sky(first + number)
         channel = None if case.common else int(np.random.default_rng([2032, number]).integers(2))
         change = sky.change(case, range(2) if case.common else [channel])
         analysis, null, factor = sky.context.analysis, sky.context.null, 1.0
