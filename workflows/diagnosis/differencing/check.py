@@ -1,7 +1,7 @@
 """Maps of differencing scans: are p-values uniform where nothing is wrong, and effects named where they are put in?
 
     python workflows/diagnosis/differencing/check.py [--nside 64] [--skies 200] [--cases 4] [--controls N] [--nuisances]
-        [--parts FOLDER] [-o FILE]
+        [--first NUMBER] [--effects NAME ...] [--strong] [--parts FOLDER] [-o FILE]
 
 With ``--parts`` every result of a simulation is kept, and a run that was stopped goes on where it was.
 
@@ -193,6 +193,9 @@ def main() -> None:
     parser.add_argument("--skies", type=int, default=200)
     parser.add_argument("--pulls", type=int, default=100, help="skies with each effect whose amplitude is fitted alone")
     parser.add_argument("--cases", type=int, default=4, help="skies of each effect and S/N")
+    parser.add_argument("--first", type=int, default=0, help="number of the first of these skies")
+    parser.add_argument("--effects", nargs="+", choices=(*PUT_IN, ONE_SIDE), default=(*PUT_IN, ONE_SIDE))
+    parser.add_argument("--strong", action="store_true", help="the larger amplitude of each alone")
     parser.add_argument("--controls", type=int, default=0, help="perfect data sets that are diagnosed")
     parser.add_argument("--nuisances", action="store_true", help="declare what is known of each channel")
     parser.add_argument("--simulations", type=int, help="of the model; default: ten for each element")
@@ -236,7 +239,7 @@ def main() -> None:
             write()
         result["cases"] = []
         with asking(call, True, Kept(chosen.parts), "simulations of fitted effects") as ask:
-            for amplitude, target, name, number in cases(context, chosen.cases):
+            for amplitude, target, name, number in cases(context, chosen):
                 maps = data(acting(run, name, amplitude), number)
                 found = diagnose_data(ObservedMaps(context, maps, ask), name)
                 result["cases"].append(described(found, name, amplitude, target))
@@ -244,12 +247,13 @@ def main() -> None:
                 write()
 
 
-def cases(context: DiagnosisContext, count: int) -> Iterator[tuple[float, float | None, str, int]]:
+def cases(context: DiagnosisContext, chosen: argparse.Namespace) -> Iterator[tuple[float, float | None, str, int]]:
     """Yield amplitude, expected S/N, what is put in, and realization."""
-    for number, high in product(range(count), (1, 0)):
+    numbers = range(chosen.first, chosen.first + chosen.cases)
+    for number, high in product(numbers, (1,) if chosen.strong else (1, 0)):
         for place, name in enumerate((*PUT_IN, ONE_SIDE)):
             amplitude, target = amplitudes(context, "beam_ellipticity" if name == ONE_SIDE else name)[high]
-            if high or name != ONE_SIDE:  # of one side half is seen
+            if name in chosen.effects and (high or name != ONE_SIDE):  # of one side half is seen
                 yield amplitude, target, name, 10_000 * (1 + place) + 1000 * high + number
 
 

@@ -189,16 +189,32 @@ class Sky:
         return change
 
 
+def factor_of(snr, wanted):
+    """Return the factor at which an S/N has a value, by secants of its logarithm: it may grow as the square."""
+    where, power = [0.0], 1.0
+    reached = [np.log(snr(1.0) / wanted)]
+    while abs(reached[-1]) > 0.005 and len(where) < 20:
+        if len(where) > 1:
+            power = np.clip(np.diff(reached[-2:])[0] / np.diff(where[-2:])[0], 1.0, 4.0)
+        where.append(where[-1] - reached[-1] / power)
+        reached.append(np.log(snr(np.exp(where[-1])) / wanted))
+    return np.exp(where[-1])
+
+
 def main(span="0:24", cases=CASES, first=95_000):
     """Scale each of twelve cases to an S/N of the data vector, and print what is said of it."""
     for number in range(24)[slice(*map(int, span.split(":")))]:
         case, wanted, sky = cases[number % 12], (10.0, 20.0)[number // 12], Sky(first + number)
         channel = None if case.common else int(np.random.default_rng([2032, number]).integers(2))
         change = sky.change(case, range(2) if case.common else [channel])
-        analysis, null, factor = sky.context.analysis, sky.context.null, 1.0
-        before = analysis.data_vector(list(sky.maps))
-        for _ in range(4):
-            factor *= wanted / null.expected_snr(analysis.data_vector(list(sky.maps + factor * change)) - before)
+        before = sky.context.analysis.data_vector(list(sky.maps))
+
+        def snr(factor, sky=sky, change=change, before=before):
+            return sky.context.null.expected_snr(
+                sky.context.analysis.data_vector(list(sky.maps + factor * change)) - before
+            )
+
+        factor = factor_of(snr, wanted)
         data = ObservedMaps(sky.context, list(sky.maps + factor * change), ask)
         found, reduction = unlisted.structures_of(data, sky.scene, sky.search)
         owner = None if case.common else sky.run.channels[channel].name
