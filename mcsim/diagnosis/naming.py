@@ -71,13 +71,16 @@ def _effects(context: DiagnosisContext, one: Explanation) -> list[Effect]:
 
 
 def _actions(data: DataSet[Any], refined: Refined, one: Explanation) -> Iterator[Action]:
-    """Yield what each effect of a set does to the data, simulated at its amplitude if it can be."""
+    """Yield what each effect of a set does to the data, simulated at its amplitude if it can be.
+
+    What is drawn, and a map-making that stops early, which leaves noise as well as sky, differ from sky to sky.
+    """
     context, bank, sites = data.context, data.context.bank, data.context.analysis.model.survey.channels
     whole = np.concatenate([refined.templates, bank.slice_matrix]) if len(bank.slice_matrix) else refined.templates
     for member, theta, covariance in parts_of(context.candidates, one.members, one.fit):
         candidate = context.candidates[member]
         t = whole[:, list(candidate.columns)]
-        draws, scatter = refined.candidates[member].scatter is not None, None
+        draws, scatter = refined.candidates[member].scatter is not None or candidate.parametrization.nonlinear, None
         skies, growth = context.settings.scatter_skies if draws else context.settings.constrained_skies, 1.0
         try:
             effect = candidate.detected(theta, covariance)
