@@ -68,12 +68,14 @@ class Structure:
         return mine == theirs
 
     def extends(self, other: "Structure") -> bool:
-        """Return True for a function of time that has more than its constant, if that is the other one."""
-        if self.kind != "elongation" and not self.kind.endswith(ANY):
+        """Return True for what has more than its mean, in time or on the sky, if that is the other one."""
+        if self.kind != "elongation" and not self.kind.endswith(ANY) and not self.kind.startswith(("degrees", "lat")):
             return False
+        stage = {"added": ("added", "power")}.get(self.stage, (self.stage,))
         same = (self.acts_on, self.channel, self.split, self.index)
-        constant = "constant" if self.stage == "gain" else "monopole"
-        return other.kind == constant and (other.acts_on, other.channel, other.split, other.index) == same
+        mean = {"gain": "constant", "noise": "level"}.get(self.stage, "monopole")
+        alike = (other.acts_on, other.channel, other.split, other.index) == same
+        return other.stage in stage and other.kind == mean and alike
 
     @property
     def by_coordinate(self) -> bool:

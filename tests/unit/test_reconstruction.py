@@ -204,6 +204,21 @@ def test_a_pulse_is_told_from_its_mean():
     assert short > long
 
 
+@pytest.mark.parametrize(
+    ("stage", "mean", "more"), [("noise", "level", "degrees 0-2"), ("gain", "constant", "degrees 0-2")]
+)
+def test_a_pattern_is_told_from_its_mean(stage, mean, more):
+    """What chance adds to a large mean from place to place is no pattern."""
+    simulations = np.random.default_rng(1).normal(size=(400, 9))
+    whole, level = plain(stage, range(9)), plain(stage, [0])
+    search = Search((replace(whole, kind=more), replace(level, kind=mean)), simulations)
+    x = np.full(9, 1.0)
+    x[0] = 60.0
+    long, short = search.evidences(x)
+    assert search.constants == {0: 1}
+    assert short > long
+
+
 def test_a_boost_is_that_of_the_library_for_small_velocities():
     alm, beta = random_alm(3, 6), 1e-5
     sky = systematics.get("boost")(amplitude=beta, lon_deg=30.0, lat_deg=40.0)
