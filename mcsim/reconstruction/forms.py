@@ -20,6 +20,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
+from mcsim.sphere.rotation import rotation_matrix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.systematics.base import Alm, Draw, Effect, Map, Site
 from mcsim.systematics.parametrization import Parametrization, Vector
@@ -218,13 +219,19 @@ class AddedToSamples(InTime):
         """Return what the coefficients of a wave multiply that is a dipole, shape (n,) each.
 
         "Sun": the line of sight along the Earth's motion, and towards the Sun; "lobe": the dipole along the beam's x
-        and y and the line of sight, uK.
+        and y and the line of sight, uK; "Galaxy": a constant, and the quadrupole about the galactic pole along
+        these.
         """
         outward, south, east = axes(theta, phi)
         pointing = site.pointed(self.name)
         if self.wave == "Sun":
             towards = (heading(pointing.model, time_s, site.frame, phase) for phase in (0.0, 0.5 * np.pi))
             return [np.sum(one * outward, axis=0) for one in towards]
+        if self.wave == "Galaxy":
+            pole = rotation_matrix(site.frame, "galactic")[2]
+            z, a, b = (pole @ one for one in (outward, south, east))
+            x, y = np.cos(psi) * a + np.sin(psi) * b, np.cos(psi) * b - np.sin(psi) * a
+            return [np.ones_like(z), x**2 - y**2, 2.0 * x * y, x * z, y * z, z**2 - 1.0 / 3.0]
         c, s, (a, b) = np.cos(psi), np.sin(psi), (site.dipole_uk @ south, site.dipole_uk @ east)
         return [c * a + s * b, c * b - s * a, site.dipole_uk @ outward]
 
@@ -232,7 +239,7 @@ class AddedToSamples(InTime):
         if self.wave == "sky":
             self.check_frame(site)
             value = _map_of(self.coefficients)[healpy.ang2pix(_NSIDE, theta, phi)]
-        elif self.wave in ("Sun", "lobe"):
+        elif self.wave in ("Sun", "lobe", "Galaxy"):
             value = np.array(self.coefficients) @ np.array(self.components(time_s, theta, phi, psi, site))
         else:
             value = self.over_time(time_s, psi, site)
@@ -265,22 +272,26 @@ class GainOfOne(GainOverTime):
 
 @dataclass(frozen=True, kw_only=True)
 class Elsewhere(Form):
-    """Samples have a part of the signal that the beam would have in another direction of its own frame.
+    """Samples have a part of the signal that the beam would have in other directions of its own frame.
 
-    ``factor`` times sky and dipole there, or the sky alone, up to l = ``top``: a lobe has as many orders.
+    ``factor`` times the weighted sum of sky and dipole there, or the sky alone, up to l = ``top``: a lobe has as many
+    orders.
     """
 
-    towards: ClassVar[tuple[float, float, float]]  #: unit vector, along x and y of the beam and outward
+    #: unit vectors, along x and y of the beam and outward, and their weights
+    towards: ClassVar[tuple[tuple[float, float, float, float], ...]]
     factor: ClassVar[float]
     on_dipole: ClassVar[bool] = True
     top: ClassVar[int]
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        """Add Y*_lm of the direction, as of a beam that points there."""
+        """Add Y*_lm of the directions, as of a beam that points there."""
         top = min(self.top, beam.lmax)
-        angles = np.array(healpy.vec2dir(np.array(self.towards)))[None]
-        one = np.ones((1, 1))
-        lobe = ducc0.sht.adjoint_synthesis_general(map=one, loc=angles, spin=0, lmax=top, epsilon=1e-10, nthreads=1)[0]
+        *vector, weight = np.array(self.towards).T
+        angles = np.reshape(healpy.vec2dir(*vector), (2, -1)).T
+        lobe = ducc0.sht.adjoint_synthesis_general(
+            map=weight[None], loc=angles, spin=0, lmax=top, epsilon=1e-10, nthreads=1
+        )[0]
         kernel = site.beam.blm[0, : top + 1].real * np.sqrt(4.0 * np.pi / (2.0 * np.arange(top + 1) + 1.0))
         kernel[: 0 if self.on_dipole else 2] = 0.0
         blm = np.zeros((max(beam.mmax, top) + 1, beam.lmax + 1), dtype=np.complex128)

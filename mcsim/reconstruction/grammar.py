@@ -13,7 +13,18 @@ from numpy.typing import NDArray
 from scipy.special import poch
 
 from mcsim.reconstruction.forms import REFERENCE_GHZ
-from mcsim.reconstruction.scores import ACTED_ON, ELONGATION, GAIN, HARMONICS, MODULATION, ORDERS, Key, Scene, View
+from mcsim.reconstruction.scores import (
+    ACTED_ON,
+    ELONGATION,
+    GAIN,
+    HARMONICS,
+    MODULATION,
+    MONTH,
+    ORDERS,
+    Key,
+    Scene,
+    View,
+)
 from mcsim.sphere import real
 from mcsim.sphere.rotation import rotation_matrix
 from mcsim.support.arrays import Matrix, Vector
@@ -68,12 +79,15 @@ class Structure:
         return mine == theirs
 
     def extends(self, other: "Structure") -> bool:
-        """Return True for a function of time that has more than its constant, if that is the other one."""
-        if self.kind != "elongation" and not self.kind.endswith(ANY):
+        """Return True for what has more than its mean, in time or on the sky, if that is the other one."""
+        longer = self.kind in ("elongation", "Galaxy") or self.kind.startswith(("degrees", "latitude"))
+        if not longer and not self.kind.endswith(ANY):
             return False
+        stage = {"added": ("added", "power")}.get(self.stage, (self.stage,))
         same = (self.acts_on, self.channel, self.split, self.index)
-        constant = "constant" if self.stage == "gain" else "monopole"
-        return other.kind == constant and (other.acts_on, other.channel, other.split, other.index) == same
+        mean = {"gain": "constant", "noise": "level"}.get(self.stage, "monopole")
+        alike = (other.acts_on, other.channel, other.split, other.index) == same
+        return other.stage in stage and other.kind == mean and alike
 
     @property
     def by_coordinate(self) -> bool:
@@ -169,12 +183,14 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
     yield from _added(scene)
     lobe: list[Key] = [("lobe", 0), ("lobe", 1), ("dipole",)]
     yield "added", "dipole", "spacecraft", "lobe", lobe, None
+    if len(view.w) > 1:
+        yield "added", "", "spacecraft", "Galaxy", [("added", 0), *(("Galaxy", k) for k in range(5))], None
     for name in view.elsewhere:
         if all(name in scene.views[i].elsewhere for i in kept):
             for on in ACTED_ON[:2]:
                 yield "elsewhere", on, "spacecraft", name, [("elsewhere", name, on)], None
             if name.startswith("line"):
-                yield "added", "dipole", "spacecraft", name, lobe, scene.elsewhere[view.channel][name][None]
+                yield "added", "dipole", "spacecraft", name, lobe, scene.elsewhere[view.channel][name][:, :3]
     for on in ("", *ACTED_ON) if split == ALIKE else ("",):
         yield from _timed(scene, view, on)
     noise: list[Key] = [("noise", j) for j in range(9)]
@@ -221,6 +237,8 @@ def _timed(scene: Scene, view: View, on: str) -> Iterator[_Form]:
     for wave in ("spin", "year"):
         every = [key for k in range(1, HARMONICS + 1) for key in waves[f"{wave} {k}"]]
         yield stage, on, "time", f"{wave} {ANY}", [constant, *every], None
+    month = [key for k in range(MONTH[0], MONTH[1] + 1) for key in waves[f"year {k}"]]
+    yield stage, on, "time", "month", month, None
     if not on:
         yield stage, "", "Sun", "dipole", waves["Sun"], None
         cosines = [waves[f"spin {k}"][0] for k in range(1, ELONGATION + 1)]

@@ -9,7 +9,7 @@ import numpy as np
 
 from mcsim.reconstruction.forms import FORMS, Form
 from mcsim.reconstruction.grammar import ALIKE, ANY, OPPOSITE, Structure
-from mcsim.reconstruction.scores import ELSEWHERE, Scene
+from mcsim.reconstruction.scores import ELSEWHERE, MONTH, Scene
 from mcsim.support.arrays import Vector
 
 CONSTANT = float(np.sqrt(4.0 * np.pi))  #: real coefficient of degree 0 of a map that is one everywhere
@@ -117,7 +117,7 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             return "GainOfOne", {"on_sky": structure.acts_on == "sky", **timed}
         case "elsewhere", _ if alike:
             channel = 0 if structure.channel is None else scene.channels.index(structure.channel)
-            towards = tuple(map(float, scene.elsewhere[channel][structure.kind]))
+            towards = tuple(tuple(map(float, one)) for one in scene.elsewhere[channel][structure.kind])
             acting = {"towards": towards, "on_dipole": "dipole" in structure.acts_on}
             return "Elsewhere", {"factor": float(theta[0]), "top": ELSEWHERE, **acting}
         case "gain", _ if not alike:
@@ -158,6 +158,8 @@ def _wave(structure: Structure) -> dict[str, Any]:
         return {"wave": "Sun"} if wave == "dipole" else {"wave": "spin", "harmonic": 0}
     if structure.stage == "added" and structure.acts_on == "dipole":
         return {"wave": "lobe"}
+    if wave == "month":
+        return {"wave": "year", "harmonic": MONTH[0]}
     return {"wave": wave, "harmonic": int(rest)} if rest.isdigit() else {"wave": wave, "harmonic": 0}
 
 
@@ -167,6 +169,8 @@ def _numbers(structure: Structure, theta: Vector) -> tuple[float, ...]:
         cosines = np.stack([theta, np.zeros_like(theta)], axis=1).ravel()
         waves = cosines if structure.kind == "elongation" else np.insert(theta, 1, 0.0)
         return (float(waves[0]) / CONSTANT, *map(float, waves[1:]))
+    if structure.kind == "Galaxy":
+        return float(theta[0]) / CONSTANT, *map(float, theta[1:])
     found = theta if structure.mix is None else structure.mix.T @ theta
     return tuple(
         map(float, np.append(0.0, found) if structure.frame != "Sun" and structure.kind == "dipole" else found)

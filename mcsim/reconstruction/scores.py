@@ -19,14 +19,16 @@ from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.reconstruction.forms import boosts, rotations
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
+from mcsim.sphere.rotation import rotation_matrix
 from mcsim.sphere.sky import dipole_alm
-from mcsim.support.arrays import Alm, Cl, Map, Vector, divided
+from mcsim.support.arrays import Alm, Cl, Map, Matrix, Vector, divided
 from mcsim.systematics.spacecraft import axes
 
 ADDED, GAIN = 8, 4  #: highest degree of patterns that are added, and of those that multiply
 ORDERS = 4  #: highest order of a beam, and of what follows its orientation
 MODULATION = 2  #: highest degree of patterns that multiply the sky itself
 ELONGATION = 6  #: highest harmonic of the spin phase in what depends on the distance from the Sun
+MONTH = (12, 14)  #: harmonics of the year that a month is made of, from 26 to 30 days
 HARMONICS = 4  #: highest harmonic of spin phase, year and orientation that is said by itself
 BINS = 4  #: ranges of degrees of a profile in l, equal in log l
 ACTED_ON = ("sky and dipole", "sky", "dipole")  #: what a wave multiplies, if it is not added
@@ -70,9 +72,9 @@ class Scene:
     sky_power: Cl
     split_orders: int  #: highest order of a beam that is measured in each map by itself
     views: tuple[View, ...]  #: maps, channel by channel
-    #: directions elsewhere in the frame of each channel's beam (x, y, outward), by what is there, if it is known when
-    #: and how every sample was pointed, and splits are spans of time; else none
-    elsewhere: tuple[Mapping[str, Vector], ...]
+    #: directions elsewhere in the frame of each channel's beam (x, y, outward) with weights, shape (n, 4), by what
+    #: is there, if it is known when and how every sample was pointed, and splits are spans of time; else none
+    elsewhere: tuple[Mapping[str, Matrix], ...]
 
     @property
     def timed(self) -> bool:
@@ -112,6 +114,7 @@ class Scene:
             for kind in ("gain of the sky", "gain"):
                 found += [(kind, i, j) for j in range((min(GAIN, self.lmax) + 1) ** 2)]
             found += [(kind, i) for kind in ("dipole", "square of the sky", "square", "cube")]
+            found += [("Galaxy", i, k) for k in range(5 if len(view.w) > 1 else 0)]
             found += [("lobe", i, 0), ("lobe", i, 1), *(("rotation", i, axis) for axis in range(3))]
             every = [(name, c) for name, maps in view.waves.items() for c in range(len(maps))]
             found += [(on, i, name, c) for on in ("", *ACTED_ON) for name, c in every]
@@ -150,7 +153,8 @@ class Scene:
             found.append(real.coefficients(adjoint, self.lmax, self.degree))
             top = min(GAIN, self.lmax)
             found += [self._without_dipole(r, sky, adjoint, top), _low(r * whole, top)]
-            found.append(np.array([r @ self.dipole, r @ sky**2, r @ whole**2, r @ whole**3, *self._lobe(r, view)]))
+            found.append(np.array([r @ self.dipole, r @ sky**2, r @ whole**2, r @ whole**3]))
+            found += [self._galaxy(r, view), np.array(self._lobe(r, view))]
             through = (alm_.multiply(one, view.response, self.lmax) for one in turned)
             found.append(np.array([_product(adjoint, one, self.lmax) for one in through]))
             every = [one for maps in view.waves.values() for one in maps]
@@ -172,6 +176,19 @@ class Scene:
         south, east = self._tangent
         c, s = view.w[0].real, -view.w[0].imag  # means of cos psi and sin psi
         return float(r @ (c * south + s * east)), float(r @ (c * east - s * south))
+
+    def _galaxy(self, r: Map, view: View) -> Vector:
+        """Return the scores of the quadrupole about the galactic pole, as a lobe that turns with the beam sees it."""
+        if len(view.w) < 2:
+            return np.zeros(0)
+        frame = axes(*healpy.pix2ang(self.nside, np.arange(12 * self.nside**2)))
+        pole = rotation_matrix(self.frame, "galactic")[2]
+        outward, south, east = (pole @ one for one in frame)
+        (c, c2), (s, s2) = view.w[:2].real, -view.w[:2].imag
+        plus, cross = south**2 - east**2, 2.0 * south * east
+        turned = [c2 * plus + s2 * cross, c2 * cross - s2 * plus]
+        turned += [outward * (c * south + s * east), outward * (c * east - s * south), outward**2 - 1.0 / 3.0]
+        return np.array(turned) @ r
 
     @cached_property
     def _tangent(self) -> tuple[Map, Map]:

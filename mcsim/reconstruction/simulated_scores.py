@@ -20,7 +20,7 @@ from mcsim.datavector.wiener_filter import Model, wiener_filter
 from mcsim.instrument.scan import MapGrid
 from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.reconstruction.forms import AddedToSamples
-from mcsim.reconstruction.scores import ELONGATION, HARMONICS, ORDERS, Scene, View, coarse
+from mcsim.reconstruction.scores import ELONGATION, HARMONICS, MONTH, ORDERS, Scene, View, coarse
 from mcsim.simulation.pixel_means import signal_of
 from mcsim.simulation.tod import samples
 from mcsim.support import folders
@@ -38,12 +38,15 @@ PER_TASK = 10
 
 WAVES: dict[str, dict[str, Any]] = {
     **{f"spin {k}": {"wave": "spin", "harmonic": k} for k in range(1, ELONGATION + 1)},
-    **{f"year {k}": {"wave": "year", "harmonic": k} for k in range(1, HARMONICS + 1)},
+    **{
+        f"year {k}": {"wave": "year", "harmonic": k} for k in (*range(1, HARMONICS + 1), *range(MONTH[0], MONTH[1] + 1))
+    },
     "trend": {"wave": "trend"},
     "Sun": {"wave": "Sun"},
 }
 """What follows time, of two components each but for the trend, by name: class variables of a form."""
 
+TAIL_DEG = 15.0  #: of the spin, after which the tail of a slow response has fallen by e
 LAGS = {"-1/8": -0.125, "+1/8": 0.125, "-1/4": -0.25, "+1/4": 0.25, "1/2": 0.5}  #: turns of the spin after a sample
 SAMPLES = 200_000  #: of a map, about, by which directions elsewhere are known
 
@@ -95,20 +98,26 @@ def scene_of(model: Model) -> Scene:
     )
 
 
-def directions(own: tuple[float, float], lines: Mapping[str, tuple[float, float]]) -> dict[str, Vector]:
-    """Return unit vectors in the frame of a beam (its x and y, outward), shape (3,), by what is there.
+def directions(own: tuple[float, float], lines: Mapping[str, tuple[float, float]]) -> dict[str, Matrix]:
+    """Return unit vectors in the frame of a beam (its x and y, outward) with weights, shape (n, 4), by what is there.
 
     ``own`` and ``lines`` are boresight angle and azimuth, degrees: of the beam, and of other channels.
     """
     found = {f"line {name}": line for name, line in lines.items() if line != own}
     found |= {f"spin {name}": (own[0], own[1] + 360.0 * turns) for name, turns in LAGS.items()}
+    taps = TAIL_DEG * -np.log(1.0 - (np.arange(16) + 0.5) / 16)
     outward, south, east = (one[:, 0] for one in axes(*np.deg2rad(own)[:, None]))
     frame = np.stack([east, -south, outward])
-    seen = {name: frame @ axes(*np.deg2rad(line)[:, None])[0][:, 0] for name, line in found.items()}
-    return seen | {"opposite": np.array([0.0, 0.0, -1.0])}
+
+    def there(line: tuple[float, float], weight: float = 1.0) -> Vector:
+        return np.append(frame @ axes(*np.deg2rad(line)[:, None])[0][:, 0], weight)
+
+    seen = {name: there(line)[None] for name, line in found.items()}
+    lag = [there((own[0], own[1] - one), 1.0 / len(taps)) for one in taps]
+    return seen | {"opposite": np.array([[0.0, 0.0, -1.0, 1.0]]), "lag": np.array([*lag, [0.0, 0.0, 1.0, -1.0]])}
 
 
-def _elsewhere(pointing: Pointing, grid: MapGrid, wanted: Mapping[str, Vector]) -> dict[str, csr_matrix]:
+def _elsewhere(pointing: Pointing, grid: MapGrid, wanted: Mapping[str, Matrix]) -> dict[str, csr_matrix]:
     """Return the mean over the samples of every coarse pixel of what a map has in other directions."""
     period = pointing.model.duration_days * SECONDS_PER_DAY * np.ptp(grid.time_range) / SAMPLES
     model, line = pointing.model, pointing.line
@@ -119,10 +128,10 @@ def _elsewhere(pointing: Pointing, grid: MapGrid, wanted: Mapping[str, Vector]) 
     for chunk in samples(model, line, replace(grid, nside=nside)):
         outward, south, east = axes(chunk.theta, chunk.phi)
         x, y = (np.cos(a) * south + np.sin(a) * east for a in (chunk.psi, chunk.psi + 0.5 * np.pi))
-        for name, (a, b, c) in wanted.items():
+        for name, (a, b, c, weight) in ((name, one) for name, rows in wanted.items() for one in rows):
             there = healpy.vec2pix(nside, *(a * x + b * y + c * outward))
-            total[name] += csr_matrix((np.ones(len(there)), (chunk.pixel, there)), total[name].shape)
-    hits = next(iter(total.values())).sum(axis=1).A1
+            total[name] += csr_matrix((np.full(len(there), weight), (chunk.pixel, there)), total[name].shape)
+    hits = total["opposite"].sum(axis=1).A1
     return {name: diags(divided(1.0, hits)) @ one for name, one in total.items()}
 
 

@@ -59,6 +59,8 @@ def _what(structure: Structure, theta: Vector) -> str:
             return f"is added to the signal, fixed to the sky ({_pattern(kind)})"
         case "added", "spacecraft" if kind == "lobe":
             return f"is the dipole as a lobe fixed to the spacecraft sees it, {_lobe(theta)}"
+        case "added", "spacecraft" if kind == "Galaxy":
+            return "is added to the signal as the Galaxy is in a lobe fixed to the spacecraft"
         case "added", "Sun":
             return f"is added to the signal and depends on {SUN[kind]}"
         case "added", "spacecraft" if kind.startswith("line"):
@@ -117,6 +119,8 @@ def _pattern(kind: str) -> str:
 
 def _there(kind: str) -> str:
     what, _, where = kind.partition(" ")
+    if what == "lag":
+        return "in place of the line of sight, along the scan before, in a tail"
     if what == "spin":
         turns = f"{where.lstrip('+-')} of a spin"
         return f"{turns} {'before' if where[0] == '-' else 'after'}" if where[0] in "+-" else f"{turns} away"
@@ -127,6 +131,8 @@ def _wave(kind: str) -> str:
     wave, _, harmonic = kind.partition(" ")
     if wave == "trend":
         return "time, growing steadily"
+    if wave == "month":
+        return "month"
     often = {ANY: ", in any way", "1": ""}.get(harmonic, f", {_TIMES.get(harmonic)} a {wave}")
     return ("year" if wave == "year" else "spin phase") + often
 
