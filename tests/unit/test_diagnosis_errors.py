@@ -35,6 +35,15 @@ def test_an_error_where_a_bound_fixes_a_parameter_is_that_along_the_bound() -> N
     assert found.sigma == pytest.approx(float(unit @ np.linalg.solve(covariance, unit)) ** -0.5, rel=1e-9)
 
 
+def test_an_amplitude_that_is_a_power_of_its_coordinate_has_the_error_of_its_slope() -> None:
+    """Iterations are fitted as 1.5^n - 1: an error of 10 % of that is 0.1 / ln 1.5 iterations, to second order."""
+    candidate = Candidate(systematics.get("mapmaking_convergence"), "W1", (0,))
+    theta = np.array([1.5**30.0 - 1.0])
+    covariance = 0.01 * np.outer(theta, theta)
+    [found] = effects_of([candidate], [0], Fit(theta, covariance, 1000, 100.0, 1.0, 0.0, 1, 1.0))
+    assert found.sigma == pytest.approx(0.1 / np.log(1.5), rel=0.01)
+
+
 @pytest.mark.parametrize(("name", "followed"), [("beam_coma", False), ("beam_ellipticity", True)])
 def test_no_slope_is_taken_along_an_amplitude_that_the_effect_cannot_follow(name: str, followed: bool) -> None:
     """The four amplitudes of a coma have two parameters: slopes along each would make a singular matrix."""
