@@ -139,9 +139,11 @@ def _sigma(candidate: Candidate, theta: Vector, covariance: Vector, parameter: s
     """Return the standard error of a parameter, from its slopes in the coordinates over their own errors.
 
     A step of one error moves also a value at the edge of what is possible. What the data do not constrain is not
-    varied. The error of an amplitude is at least that with all else fixed, and just that where bounds fix the rest.
+    varied. The error of an amplitude to which coordinates are proportional is at least that with all else fixed, and
+    just that where bounds fix the rest.
     """
-    scale, slopes, how = np.sqrt(np.diag(covariance)), np.zeros(len(theta)), candidate.parametrization
+    how = candidate.parametrization
+    scale, slopes = np.sqrt(np.diag(covariance)), np.zeros(len(theta))
     precision = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
     constrained = how.constrained(theta, precision)
     for k in np.flatnonzero((scale > 0.0) & ((constrained != 0.0) | (theta == 0.0))):
@@ -149,8 +151,8 @@ def _sigma(candidate: Candidate, theta: Vector, covariance: Vector, parameter: s
         up, down = (getattr(candidate.with_coordinates(constrained + s, precision), parameter) for s in (step, -step))
         slopes[k] = (up - down) / (2.0 * scale[k])
     inside, variance = candidate.fitted(theta, covariance), max(float(slopes @ covariance @ slopes), 0.0)
-    unit = how.coordinates(replace(inside, amplitude=inside.amplitude + 1.0)) - how.coordinates(inside)
-    if parameter == "amplitude" and (known := float(unit @ precision @ unit)) > 0.0:
+    unit = how.coordinates(replace(inside, amplitude=1.0))
+    if parameter == "amplitude" and not how.nonlinear and (known := float(unit @ precision @ unit)) > 0.0:
         variance = max(variance * (inside == candidate.with_coordinates(constrained, precision)), 1.0 / known)
     return float(np.sqrt(variance))
 

@@ -125,13 +125,14 @@ class Search:
 
         ``sky`` knows what structures do on the sky of the data, whose patterns make scores correlated that are
         independent on average over skies. It judges between the finalists, and takes out what is found before the rest
-        is searched; None: by averages over skies.
+        is searched; None: by averages over skies. What a structure leaves for one that is like it is its
+        shape, and no further structure.
         """
         found: list[Found] = []
         rest = scores
         for _ in range(MOST):
             values = self.evidences(rest)
-            values[[one.structure for one in found]] = -np.inf
+            values[[any(one.like(self.grammar[k.structure]) for k in found) for one in self.grammar]] = -np.inf
             p = self.pvalue(float(values.max()))
             if p > LEVEL:
                 break

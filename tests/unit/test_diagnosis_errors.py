@@ -35,13 +35,14 @@ def test_an_error_where_a_bound_fixes_a_parameter_is_that_along_the_bound() -> N
     assert found.sigma == pytest.approx(float(unit @ np.linalg.solve(covariance, unit)) ** -0.5, rel=1e-9)
 
 
-def test_an_amplitude_that_is_a_power_of_its_coordinate_has_the_error_of_its_slope() -> None:
-    """Iterations are fitted as 1.5^n - 1: an error of 10 % of that is 0.1 / ln 1.5 iterations, to second order."""
-    candidate = Candidate(systematics.get("mapmaking_convergence"), "W1", (0,))
-    theta = np.array([1.5**30.0 - 1.0])
-    covariance = 0.01 * np.outer(theta, theta)
-    [found] = effects_of([candidate], [0], Fit(theta, covariance, 1000, 100.0, 1.0, 0.0, 1, 1.0))
-    assert found.sigma == pytest.approx(0.1 / np.log(1.5), rel=0.01)
+def test_the_error_of_a_whole_number_is_in_its_own_unit() -> None:
+    """Coordinates of a map-making that stops early are 1.5^n - 1, not n times those of one iteration."""
+    effect = systematics.get("mapmaking_convergence")
+    candidate, size = Candidate(effect, "W1", (0,)), 1.5**30
+    found_at = Fit(np.array([size - 1.0]), np.array([[(0.1 * size) ** 2]]), 1000, 100.0, 1.0, 0.0, 1, 1.0)
+    [found] = effects_of([candidate], [0], found_at)
+    assert found.amplitude == pytest.approx(30.0, abs=1e-6)
+    assert found.sigma == pytest.approx(np.log(1.1 / 0.9) / (2.0 * np.log(1.5)), rel=1e-6)
 
 
 @pytest.mark.parametrize(("name", "followed"), [("beam_coma", False), ("beam_ellipticity", True)])
