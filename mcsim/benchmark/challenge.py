@@ -17,10 +17,10 @@ from mcsim.benchmark.models import LearnedModel, learned_model, workers_of
 from mcsim.benchmark.out_of_library import library_with, responses
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.datavector.campaign import Batch, seeded, with_effects
-from mcsim.datavector.map_checks import read_maps
+from mcsim.datavector.map_checks import of_pixel_means, read_maps
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
-from mcsim.ensemble.maps import file_names, write_map
+from mcsim.ensemble.maps import POINTING, file_names, write_map
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
 from mcsim.simulation import nuisance, sampled, simulate
@@ -93,7 +93,7 @@ def make_case(settings: Settings, folder: Path, truth: Truth) -> None:
         files.write_key(folder, truth)
     with appearing(folder / files.MAPS / case) as scratch:
         for name, map_uk in maps_of(run, truth, settings.out_of_library):
-            write_map(scratch / names[name], map_uk, config.prepared_grid(run)[1])
+            write_map(scratch / names[name], map_uk, config.prepared_grid(run)[1], [POINTING[truth.sampled]])
         plain = {**config.to_dict(run), "name": case}
         (scratch / "model.toml").write_text(tomli_w.dumps(_without_none(plain)), encoding="utf-8")
         (scratch / "question.json").write_text(json.dumps({"without": list(truth.without)}) + "\n")
@@ -164,8 +164,9 @@ def run(folder: str | Path, *, workers: Workers | None = None, quiet: bool = Tru
 def diagnose_case(settings: Settings, folder: Path, case: str, without: tuple[str, ...]) -> None:
     """Write the verdict of one case; its folder appears complete or not at all."""
     model = learned_model(settings, without)
-    maps = read_maps(model.context.analysis.model, folder / files.MAPS / case)
-    found = diagnose_data(ObservedMaps(model.context, maps, model.simulate), case)
+    seen = model.context.analysis.model, folder / files.MAPS / case
+    known = model.context.of_pixel_means if of_pixel_means(*seen) else model.context
+    found = diagnose_data(ObservedMaps(known, read_maps(*seen), model.simulate), case)
     answer = {
         "evidence": [float(value) for value in found.data],
         "maximum": found.test.maximum,

@@ -8,8 +8,9 @@ import healpy
 import numpy as np
 
 from mcsim.datavector.wiener_filter import Model, Part, sky_variance
-from mcsim.ensemble.maps import file_names, first_realization
+from mcsim.ensemble.maps import POINTING, file_names, first_realization
 from mcsim.errors import InputError
+from mcsim.sphere.header import first_table, opened
 from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Map, reals
 from mcsim.support.folders import user_path
@@ -70,6 +71,17 @@ def read_maps(model: Model, folder: str | Path) -> list[Map]:
     maps = [_read(model, part, folder / names[part.name]) for part in model.parts]
     _check_differ(model, maps, [str(folder / names[part.name]) for part in model.parts])
     return maps
+
+
+def of_pixel_means(model: Model, folder: str | Path) -> bool:
+    """Return True if the headers of all maps of a folder say that mcsim's default route made them."""
+    name, wanted = POINTING[False]
+    files = file_names(model.survey.config)
+    for part in model.parts:
+        with opened(user_path(folder) / files[part.name]) as hdus:
+            if first_table(hdus).header.get(name) != wanted:
+                return False
+    return True
 
 
 def checked(model: Model, maps: Sequence[Map] | Mapping[str, Map]) -> list[Map]:

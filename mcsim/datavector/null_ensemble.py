@@ -91,6 +91,12 @@ class NullEnsemble:
         """Return the simulations without what is linear in their nuisances, shape (N, p)."""
         return without_nuisances(self.simulations, self.nuisances)
 
+    @property
+    def without_offset(self) -> "NullEnsemble":
+        """Return the ensemble of maps by the default route: its mean is that of the simulations."""
+        none = np.zeros_like
+        return replace(self, offset=none(self.offset), slice_offset=none(self.slice_offset))
+
     def first(self, count: int) -> "NullEnsemble":
         """Return the ensemble of the first simulations."""
         nuisances = None if self.nuisances is None else self.nuisances[:count]

@@ -18,7 +18,7 @@ from mcsim.datavector.analysis import Analysis, Job, analysis_of, data_vectors
 from mcsim.datavector.campaign import asking, batch
 from mcsim.datavector.candidate import TemplateBank
 from mcsim.datavector.kept import Kept
-from mcsim.datavector.map_checks import checked, read_maps
+from mcsim.datavector.map_checks import checked, of_pixel_means, read_maps
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.seeds import Checked
 from mcsim.datavector.settings import DiagnosisSettings
@@ -108,8 +108,10 @@ def diagnose(
     run, analysis, table = _analysed(run, source, data, settings, library, wanted)
     task: Callable[[Job], NDArray[np.float64]] = data_vectors if table is None else table
     maps: Sequence[NDArray[np.float64]] = ()
+    means = False
     if table is None:
         maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
+        means = isinstance(data, str | Path) and of_pixel_means(analysis.model, data)
     key = _key(run, analysis)
     with batch(processes) as call:
         whole = task if source is None else Checked(task)
@@ -119,6 +121,7 @@ def diagnose(
         known = context(analysis, ensemble if table is None else ensemble.of_mean(table.realizations), bank)
         drawn = controls.diagnose_controls(known, key, wanted, call, quiet) if wanted else None
         with asking(call, quiet, task, "simulations of fitted effects") as ask:
+            known = known.of_pixel_means if means else known
             found: DataSet[Any] = (
                 ObservedMaps(known, maps, ask) if table is None else MeasuredSpectra(known, table, ask)
             )
@@ -126,6 +129,8 @@ def diagnose(
         if diagnosis.kind == "unknown" and isinstance(found, ObservedMaps) and source is None:
             with asking(call, quiet, simulated_scores.scores, "simulations of what is not listed") as ask:
                 diagnosis = unlisted.reconstructed(diagnosis, found, ask)
+    if means:
+        diagnosis = replace(diagnosis, notes=(words.PIXEL_MEANS, *diagnosis.notes))
     if source is not None:
         diagnosis = _with_agreement(diagnosis, agreement(known))
     elif table is None:

@@ -49,6 +49,12 @@ class DiagnosisContext:
         """Return the settings of the analysis."""
         return self.analysis.settings
 
+    @property
+    def of_pixel_means(self) -> "DiagnosisContext":
+        """Return what maps by the default route are tested with: they lack what the time-ordered reference has."""
+        mean = self.null.mean - self.ensemble.offset
+        return replace(self, ensemble=self.ensemble.without_offset, null=self.null.shift(mean))
+
     def reference(self, found: Sequence[config.Effect]) -> Matrix:
         """Return the data vectors of the skies in which responses to effects are measured, shape (skies, p)."""
         return self.extended_reference(found)[:, : len(self.ensemble.elements)]

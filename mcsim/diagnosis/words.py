@@ -17,6 +17,7 @@ SEPARATION = 3.29
 """Distance in standard deviations at which the nearer of two predictions is the right one in 95 cases of 100."""
 
 LARGEST_ERROR = 0.3  #: error of a fractional reduction above which it is not quoted
+PIXEL_MEANS = "The maps' headers say that mcsim's default route made them (POINTING), and the model is that, too."
 SETS = 2  #: alternatives that a sentence has room for
 
 

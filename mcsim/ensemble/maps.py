@@ -17,6 +17,9 @@ from mcsim.sphere.checks import check_whole
 from mcsim.support.folders import appearing, unwritable, user_path, writable
 from mcsim.support.progress import reporting
 
+POINTING: dict[bool, tuple[str, Any]] = {False: ("POINTING", "pixel means"), True: ("POINTING", "samples")}
+"""Header card of maps by the default route, and sample by sample: what the pointing of samples is represented by."""
+
 _COORDINATES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
 
 
@@ -53,7 +56,8 @@ def write_maps(
     list of Path
         Folders with ``{channel}.fits``, or ``{channel}_{split}.fits`` if the run has splits: uK_CMB in RING order,
         float64, ``healpy.UNSEEN`` where nothing was observed. The header has frame (COORDSYS), unit (TUNIT1), the
-        run's name and digest (RUN, DIGEST) and the realization (REALIZ).
+        run's name and digest (RUN, DIGEST), the realization (REALIZ), and how the pointing of samples is represented
+        (POINTING): by pixel means, or sample by sample.
 
     Raises
     ------
@@ -104,7 +108,7 @@ def write_maps(
     simulate.draw_sky(shared, wanted.start)  # finds bad sky files before a folder is made
     writable(whole if not alone else whole.absolute().parent)
     ascii_name = run.name.encode("ascii", "backslashreplace").decode()  # as FITS headers require
-    header = [("RUN", ascii_name), ("DIGEST", config.digest(run))]
+    header = [("RUN", ascii_name), ("DIGEST", config.digest(run)), POINTING[sample_by_sample]]
     with reporting("maps", float(len(wanted)), "realizations", quiet) as report:
         for number, (r, target) in enumerate(targets.items()):
             if sample_by_sample:

@@ -23,6 +23,7 @@ from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
+from mcsim.ensemble.maps import POINTING, file_names, write_map
 from mcsim.errors import InputError
 from mcsim.reconstruction import simulated_scores
 from mcsim.simulation import sampled, simulate
@@ -374,6 +375,16 @@ def test_a_diagnosis_knows_the_library_that_it_is_given(tmp_path, monkeypatch):
     assert found.to_json()["verdict"] == "effect"
     assert [(one["name"], one["channel"]) for one in found.to_json()["effects"]] == [("louder", "W1")]
     assert type(found).open(tmp_path / "out").settings == found.settings
+    assert words.PIXEL_MEANS not in found.notes
+    # The reference of this instrument departs from the default route by more than its noise.
+    for dense in (False, True):
+        (folder := tmp_path / str(dense)).mkdir()
+        for name, file in file_names(run).items():
+            write_map(folder / file, maps[config.map_names(run).index(name)], run.map.frame, [POINTING[dense]])
+        again = mcsim.diagnose(run, folder, settings=settings)
+        assert (again.notes[:1] == (words.PIXEL_MEANS,)) is not dense
+        assert (again.test.pvalue == found.test.pvalue) is dense
+        assert [(one.name, one.channel) for one in again.effects] == [("louder", "W1")]
     for changes, named in (
         ({"without": ("noise_level",)}, ("noise_level",)),
         ({"library": {"other": Louder}}, ("other", "louder")),
@@ -388,6 +399,17 @@ def test_columns_and_matched_filters_know_their_candidate(small):
     assert [label[:2] for label in small.bank.labels] == [c.identity for c in small.candidates for _ in c.columns]
     for element in small.analysis.elements:
         assert (element.candidate in known) if element.kind == "matched" else element.candidate is None
+
+
+def test_maps_by_the_default_route_have_the_mean_of_the_simulations(small):
+    offset = 0.7 * small.ensemble.spread
+    ensemble = replace(small.ensemble, offset=offset, slice_offset=np.ones(len(small.ensemble.slice_elements)))
+    moved = context(small.analysis, ensemble, small.bank)
+    x = small.ensemble.reference[0]
+    assert moved.null.chi2(x + offset) == pytest.approx(small.null.chi2(x))
+    assert moved.of_pixel_means.null.chi2(x) == pytest.approx(small.null.chi2(x))
+    known = small.ensemble.extended.gaussian.mean
+    np.testing.assert_allclose(moved.of_pixel_means.ensemble.extended.gaussian.mean, known, rtol=1e-12)
 
 
 def test_exchanged_channels_are_noticed(small):

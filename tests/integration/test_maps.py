@@ -1,6 +1,7 @@
 """The maps of a run as FITS files: what they hold, what reads them back, and what is refused."""
 
 import errno
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,12 @@ from astropy.io import fits
 from distributed import Client
 
 from mcsim import config, open_ensemble
-from mcsim.datavector.map_checks import read_maps
+from mcsim.datavector.map_checks import of_pixel_means, read_maps
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import model_of
 from mcsim.ensemble import maps as maps_
 from mcsim.ensemble import runner
-from mcsim.ensemble.maps import write_maps
+from mcsim.ensemble.maps import write_map, write_maps
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
 from refusals import refused
@@ -49,6 +50,7 @@ def test_a_diagnosis_reads_what_is_written(tmp_path: Path) -> None:
     told = {"ORDERING": "RING", "COORDSYS": "G", "NSIDE": 16, "TUNIT1": "uK", "RUN": "small", "REALIZ": 3}
     assert {key: header[key] for key in told} == told
     assert header["DIGEST"] == config.digest(run)
+    assert header["POINTING"] == "pixel means"
 
 
 def test_they_are_the_maps_that_a_store_keeps(client: Client, tmp_path: Path) -> None:
@@ -78,6 +80,22 @@ def test_sample_by_sample(tmp_path: Path) -> None:
     folder = write_maps(run, tmp_path / "x", 0, sample_by_sample=True, nthreads=1)[0]
     for name, map_uk in sampled.maps(survey(run), 0):
         np.testing.assert_array_equal(healpy.read_map(folder / f"{name.replace(':', '_')}.fits", dtype=float), map_uk)
+    assert fits.getheader(folder / "V1_b.fits", 1)["POINTING"] == "samples"
+
+
+def test_a_diagnosis_knows_maps_by_the_default_route(tmp_path: Path) -> None:
+    run = config.load(halves())
+    model = model_of(survey(run), DiagnosisSettings())
+    means, samples = (
+        write_maps(run, tmp_path / str(dense), 0, sample_by_sample=dense, nthreads=1)[0] for dense in (False, True)
+    )
+    assert of_pixel_means(model, means)
+    assert not of_pixel_means(model, samples)
+    shutil.copy(samples / "W1_b.fits", means)
+    assert not of_pixel_means(model, means)
+    (means / "W1_b.fits").unlink()
+    write_map(means / "W1_b.fits", np.ones(12 * 16**2), "galactic")  # of another program
+    assert not of_pixel_means(model, means)
 
 
 @pytest.mark.parametrize(
