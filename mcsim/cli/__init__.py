@@ -295,6 +295,8 @@ def challenge_make(
     cases: Annotated[int, Option(min=1, help="Number of cases.")] = 200,
     seed: Annotated[int, Option(min=0, help="Of the draws; keep it as secret as the keys.")] = 0,
     sampled_share: Annotated[float, Option(min=0.0, max=1.0, help="Share of maps made sample by sample.")] = 0.5,
+    weakest: Annotated[float, Option(help="Smallest expected S/N of an effect.")] = 3.0,
+    strongest: Annotated[float, Option(help="Largest expected S/N of an effect.")] = 20.0,
     inventions: Annotated[Path | None, Option(metavar="FILE", help="Python file of effects in no library.")] = None,
     including: Including = None,
     simulations: Simulations = None,
@@ -303,6 +305,7 @@ def challenge_make(
 ) -> None:
     """Draw effects, make the maps of the cases, seal the keys."""
     from mcsim import config
+    from mcsim.benchmark.case import Prior
     from mcsim.benchmark.challenge import make
     from mcsim.benchmark.folder import Settings
 
@@ -310,6 +313,7 @@ def challenge_make(
     file = None if inventions is None else str(inventions)
     shared = Settings(
         config.load(model),
+        Prior(weakest=weakest, strongest=strongest),
         sampled_share=sampled_share,
         out_of_library=file,
         simulations=simulations,
