@@ -13,6 +13,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
 from mcsim.support.arrays import Map, Vector, divided
+from mcsim.systematics.sky import band_edges
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class Element:
 
 KINDS = {
     "beam": "residual × sky through the beam",
+    "monopole": "mean of the residual",
     "dipole": "dipole of the residual",
     "plane": "Galactic plane in the residual",
     "noise": "noise variance",
@@ -83,7 +85,7 @@ class Block:
 def blocks_of(model: Model) -> tuple[Block, ...]:
     """Return the blocks that do not depend on a candidate: about 30 elements a channel, and some of the sky."""
     parts = range(len(model.parts))
-    blocks = [block(model, i) for block in (_beam_block, _dipole_block, _plane_block) for i in parts]
+    blocks = [block(model, i) for block in (_beam_block, _lowest_block, _plane_block) for i in parts]
     for channel in range(len(model.response)):
         blocks += [_noise_block(model, channel), _linearity_block(model, channel)]
         if len(model.of(channel)) > 1:
@@ -142,17 +144,19 @@ def _beam_block(model: Model, part: int) -> Block:
     return Block(tuple(elements), values)
 
 
-def _dipole_block(model: Model, part: int) -> Block:
-    """Measure the dipole of the residual: x, y, z."""
-    alike = replace(of_map(model, part), ell=(1, 1), L=1, kind="dipole")
-    elements = tuple(replace(alike, name=f"dipole/{alike.name}/{axis}", component=axis) for axis in "xyz")
+def _lowest_block(model: Model, part: int) -> Block:
+    """Measure the mean of the residual, and its dipole: x, y, z."""
+    whole = of_map(model, part)
+    mean = replace(whole, name=f"monopole/{whole.name}", ell=(0, 0), L=0, M=0, parity="even", kind="monopole")
+    alike = replace(whole, ell=(1, 1), L=1, kind="dipole")
+    dipole = [replace(alike, name=f"dipole/{alike.name}/{axis}", component=axis) for axis in "xyz"]
     one, two = alm_.start(model.lmax, 0) + 1, alm_.start(model.lmax, 1) + 1
 
     def values(filtered: FilteredMaps) -> Vector:
         alm = filtered.adjoint[part]
-        return np.array([-alm[two].real, alm[two].imag, alm[one].real])
+        return np.array([alm[0].real, -alm[two].real, alm[two].imag, alm[one].real])
 
-    return Block(elements, values)
+    return Block((mean, *dipole), values)
 
 
 def _plane_block(model: Model, part: int) -> Block:
@@ -245,11 +249,9 @@ def _contrast_blocks(model: Model) -> list[Block]:
 def _sky_block(model: Model) -> Block:
     """Measure the spectrum of the sky over its expectation, minus one, odd and even degrees apart."""
     lmax = model.lmax
-    large = [(2, 11), (12, 40)] if lmax > model.settings.large_scales else []
-    ranges = [*large, *bins(41 if large else 2, lmax, model.settings.sky_bins - len(large))]
     ell = np.arange(lmax + 1)
     rows, elements = [], []
-    for (fold, parity), (low, high) in product(enumerate(("even", "odd")), ranges):
+    for (fold, parity), (low, high) in product(enumerate(("even", "odd")), _sky_ranges(model)):
         weight = np.where((ell >= low) & (ell <= high) & (ell % 2 == fold), (2.0 * ell + 1.0) * model.sky_power, 0.0)
         if weight.any():
             rows.append(weight / weight.sum())
@@ -263,6 +265,24 @@ def _sky_block(model: Model) -> Block:
         return np.asarray(means @ (ratio - 1.0))
 
     return Block(tuple(elements), values)
+
+
+def _sky_ranges(model: Model) -> list[tuple[int, int]]:
+    """Return ranges of degrees that end where a band of the effect "spectrum" does, the widest ones halved.
+
+    The change of a band would be diluted in a range that reaches beyond it.
+    """
+    bands = band_edges(model.survey.config.sky.lmax).tolist()
+    large = (12, 41) if model.lmax > model.settings.large_scales else ()
+    edges = sorted({2, model.lmax + 1, *(edge for edge in (*large, *bands) if edge <= model.lmax)})
+    ranges = [(a, b - 1) for a, b in pairwise(edges)]
+    while len(ranges) < model.settings.sky_bins:
+        widest = max(ranges, key=lambda ends: (ends[1] + 1) ** 2 - ends[0] ** 2)
+        if widest[0] == widest[1]:
+            break
+        place = ranges.index(widest)
+        ranges[place : place + 1] = bins(*widest, 2)
+    return ranges
 
 
 _FORMS = {"x": (1, 1), "y": (1, 1), "z": (1, 0), "zz": (2, 0), "xz": (2, 1), "yz": (2, 1), "xx": (2, 2), "xy": (2, 2)}
