@@ -1,6 +1,6 @@
 """The data vector: a short vector of summary statistics, each with a description."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
 
@@ -97,6 +97,28 @@ def bins(low: int, high: int, number: int) -> list[tuple[int, int]]:
     """Return ranges of degrees, both ends included, with about the same number of modes."""
     edges = np.sqrt(np.linspace(low**2, (high + 1) ** 2, number + 1)).astype(int)
     return [(int(a), int(b) - 1) for a, b in pairwise(edges)]
+
+
+def ranges_within(edges: Iterable[int], number: int) -> list[tuple[int, int]]:
+    """Return so many ranges of degrees, both ends included, that end before edges, the last of which is the end.
+
+    The ranges of the most modes are halved, or of more ranges than ``number`` those of the fewest modes are joined.
+    """
+
+    def modes(ends: tuple[int, int]) -> int:
+        return ends[1] ** 2 - ends[0] ** 2
+
+    found = sorted(set(edges))
+    while len(found) <= number:
+        low, high = max(pairwise(found), key=modes)
+        if high == low + 1:
+            break
+        (_, middle), _ = bins(low, high - 1, 2)
+        found = sorted((*found, middle + 1))
+    while len(found) > number + 1:
+        low, _ = min(zip(found, found[2:], strict=False), key=modes)
+        del found[found.index(low) + 1]
+    return [(low, high - 1) for low, high in pairwise(found)]
 
 
 def scales(lmax: int) -> list[tuple[int, int]]:
@@ -250,8 +272,14 @@ def _sky_block(model: Model) -> Block:
     """Measure the spectrum of the sky over its expectation, minus one, odd and even degrees apart."""
     lmax = model.lmax
     ell = np.arange(lmax + 1)
+    # The change of a band of the effect "spectrum" would be diluted in a range that reaches beyond it.
+    inner = [
+        *band_edges(model.survey.config.sky.lmax).tolist(),
+        *((12, 41) if lmax > model.settings.large_scales else ()),
+    ]
+    ranges = ranges_within([2, *(edge for edge in inner if 2 < edge <= lmax), lmax + 1], model.settings.sky_bins)
     rows, elements = [], []
-    for (fold, parity), (low, high) in product(enumerate(("even", "odd")), _sky_ranges(model)):
+    for (fold, parity), (low, high) in product(enumerate(("even", "odd")), ranges):
         weight = np.where((ell >= low) & (ell <= high) & (ell % 2 == fold), (2.0 * ell + 1.0) * model.sky_power, 0.0)
         if weight.any():
             rows.append(weight / weight.sum())
@@ -265,24 +293,6 @@ def _sky_block(model: Model) -> Block:
         return np.asarray(means @ (ratio - 1.0))
 
     return Block(tuple(elements), values)
-
-
-def _sky_ranges(model: Model) -> list[tuple[int, int]]:
-    """Return ranges of degrees that end where a band of the effect "spectrum" does, the widest ones halved.
-
-    The change of a band would be diluted in a range that reaches beyond it.
-    """
-    bands = band_edges(model.survey.config.sky.lmax).tolist()
-    large = (12, 41) if model.lmax > model.settings.large_scales else ()
-    edges = sorted({2, model.lmax + 1, *(edge for edge in (*large, *bands) if edge <= model.lmax)})
-    ranges = [(a, b - 1) for a, b in pairwise(edges)]
-    while len(ranges) < model.settings.sky_bins:
-        widest = max(ranges, key=lambda ends: (ends[1] + 1) ** 2 - ends[0] ** 2)
-        if widest[0] == widest[1]:
-            break
-        place = ranges.index(widest)
-        ranges[place : place + 1] = bins(*widest, 2)
-    return ranges
 
 
 _FORMS = {"x": (1, 1), "y": (1, 1), "z": (1, 0), "zz": (2, 0), "xz": (2, 1), "yz": (2, 1), "xx": (2, 2), "xy": (2, 2)}
