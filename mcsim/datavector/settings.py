@@ -123,7 +123,8 @@ class DiagnosisSettings:
     hole_iterations
         Iterations of filling unobserved pixels with the filtered sky.
     sky_bins, beam_bins
-        Bins in l of the spectrum of the sky, for each parity of l; of each azimuthal order of a beam, from m = 0.
+        Bins in l of the spectrum of the sky, for each parity of l, which end where the bands of the effect ``spectrum``
+        do; of each azimuthal order of a beam, from m = 0.
     latitude_edges
         Edges of bands of the sky, in abs(sin(latitude)).
     plane_width

@@ -1,6 +1,6 @@
 """The data vector: a short vector of summary statistics, each with a description."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
 
@@ -13,6 +13,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
 from mcsim.support.arrays import Map, Vector, divided
+from mcsim.systematics.sky import band_edges
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class Element:
 
 KINDS = {
     "beam": "residual × sky through the beam",
+    "monopole": "mean of the residual",
     "dipole": "dipole of the residual",
     "plane": "Galactic plane in the residual",
     "noise": "noise variance",
@@ -83,7 +85,7 @@ class Block:
 def blocks_of(model: Model) -> tuple[Block, ...]:
     """Return the blocks that do not depend on a candidate: about 30 elements a channel, and some of the sky."""
     parts = range(len(model.parts))
-    blocks = [block(model, i) for block in (_beam_block, _dipole_block, _plane_block) for i in parts]
+    blocks = [block(model, i) for block in (_beam_block, _lowest_block, _plane_block) for i in parts]
     for channel in range(len(model.response)):
         blocks += [_noise_block(model, channel), _linearity_block(model, channel)]
         if len(model.of(channel)) > 1:
@@ -95,6 +97,28 @@ def bins(low: int, high: int, number: int) -> list[tuple[int, int]]:
     """Return ranges of degrees, both ends included, with about the same number of modes."""
     edges = np.sqrt(np.linspace(low**2, (high + 1) ** 2, number + 1)).astype(int)
     return [(int(a), int(b) - 1) for a, b in pairwise(edges)]
+
+
+def ranges_within(edges: Iterable[int], number: int) -> list[tuple[int, int]]:
+    """Return so many ranges of degrees, both ends included, that end before edges, the last of which is the end.
+
+    The ranges of the most modes are halved, or of more ranges than ``number`` those of the fewest modes are joined.
+    """
+
+    def modes(ends: tuple[int, int]) -> int:
+        return ends[1] ** 2 - ends[0] ** 2
+
+    found = sorted(set(edges))
+    while len(found) <= number:
+        low, high = max(pairwise(found), key=modes)
+        if high == low + 1:
+            break
+        (_, middle), _ = bins(low, high - 1, 2)
+        found = sorted((*found, middle + 1))
+    while len(found) > number + 1:
+        low, _ = min(zip(found, found[2:], strict=False), key=modes)
+        del found[found.index(low) + 1]
+    return [(low, high - 1) for low, high in pairwise(found)]
 
 
 def scales(lmax: int) -> list[tuple[int, int]]:
@@ -142,17 +166,19 @@ def _beam_block(model: Model, part: int) -> Block:
     return Block(tuple(elements), values)
 
 
-def _dipole_block(model: Model, part: int) -> Block:
-    """Measure the dipole of the residual: x, y, z."""
-    alike = replace(of_map(model, part), ell=(1, 1), L=1, kind="dipole")
-    elements = tuple(replace(alike, name=f"dipole/{alike.name}/{axis}", component=axis) for axis in "xyz")
+def _lowest_block(model: Model, part: int) -> Block:
+    """Measure the mean of the residual, and its dipole: x, y, z."""
+    whole = of_map(model, part)
+    mean = replace(whole, name=f"monopole/{whole.name}", ell=(0, 0), L=0, M=0, parity="even", kind="monopole")
+    alike = replace(whole, ell=(1, 1), L=1, kind="dipole")
+    dipole = [replace(alike, name=f"dipole/{alike.name}/{axis}", component=axis) for axis in "xyz"]
     one, two = alm_.start(model.lmax, 0) + 1, alm_.start(model.lmax, 1) + 1
 
     def values(filtered: FilteredMaps) -> Vector:
         alm = filtered.adjoint[part]
-        return np.array([-alm[two].real, alm[two].imag, alm[one].real])
+        return np.array([alm[0].real, -alm[two].real, alm[two].imag, alm[one].real])
 
-    return Block(elements, values)
+    return Block((mean, *dipole), values)
 
 
 def _plane_block(model: Model, part: int) -> Block:
@@ -245,9 +271,13 @@ def _contrast_blocks(model: Model) -> list[Block]:
 def _sky_block(model: Model) -> Block:
     """Measure the spectrum of the sky over its expectation, minus one, odd and even degrees apart."""
     lmax = model.lmax
-    large = [(2, 11), (12, 40)] if lmax > model.settings.large_scales else []
-    ranges = [*large, *bins(41 if large else 2, lmax, model.settings.sky_bins - len(large))]
     ell = np.arange(lmax + 1)
+    # The change of a band of the effect "spectrum" would be diluted in a range that reaches beyond it.
+    inner = [
+        *band_edges(model.survey.config.sky.lmax).tolist(),
+        *((12, 41) if lmax > model.settings.large_scales else ()),
+    ]
+    ranges = ranges_within([2, *(edge for edge in inner if 2 < edge <= lmax), lmax + 1], model.settings.sky_bins)
     rows, elements = [], []
     for (fold, parity), (low, high) in product(enumerate(("even", "odd")), ranges):
         weight = np.where((ell >= low) & (ell <= high) & (ell % 2 == fold), (2.0 * ell + 1.0) * model.sky_power, 0.0)

@@ -30,6 +30,11 @@ KNOWN = 0.25  #: error of a band up to which the data constrain its power
 DETECTED = 3.0  #: standard errors by which a band that is constrained worse has to change to be fitted all the same
 
 
+def band_edges(lmax: int) -> Vector:
+    """Return the first degrees of all bands but the first, shape (BANDS - 1,), of a sky that ends at ``lmax``."""
+    return np.asarray(2 + np.arange(1, BANDS) * (lmax - 1) // BANDS)
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Bands(Components):
     """Fit the fractional changes of the bands."""
@@ -90,8 +95,7 @@ class Spectrum(Effect):
                 f"effect {self.name}: a band changes by {np.min(change):g}, leaving negative power; keep it above -1."
             )
         ell = np.arange(site.lmax + 1)
-        edges = 2 + np.arange(1, BANDS) * (site.lmax - 1) // BANDS
-        factor = np.sqrt(1.0 + change[np.searchsorted(edges, ell, side="right")])
+        factor = np.sqrt(1.0 + change[np.searchsorted(band_edges(site.lmax), ell, side="right")])
         factor[:2] = 1.0
         return alm_.multiply(sky, factor, site.lmax)
 

@@ -1,0 +1,51 @@
+"""Elements of the data vector whose answers to a change of the maps are known."""
+
+import numpy as np
+import pytest
+
+from instruments import two_channels
+from mcsim import config
+from mcsim.datavector.analysis import analysis_of
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.summaries import ranges_within
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+from mcsim.systematics import catalogue
+
+EDGES = (2, 12, 23, 33, 44, 54, 65)
+
+
+@pytest.fixture(scope="module")
+def analysis():
+    settings = DiagnosisSettings(beam_orders=1, split_beam_orders=1)
+    return analysis_of(config.load(two_channels("mean")), without=tuple(catalogue()), settings=settings)
+
+
+def test_a_mean_is_weighted_with_the_inverse_variance_of_its_own_map_alone(analysis) -> None:
+    """The sky that the filter finds has no monopole: all of a constant is left in the residual, times 1 / N.
+
+    Sums over pixels are integrals to some 1e-6 of the constant: degrees above 1 have as much.
+    """
+    maps = list(simulate.maps(survey(analysis.run), 0))
+    shifted = [maps[0], maps[1] + 5.0, *maps[2:]]
+    change = analysis.data_vector(shifted) - analysis.data_vector(maps)
+    found = [value for one, value in zip(analysis.elements, change, strict=True) if one.kind == "monopole"]
+    expected = 5.0 * analysis.model.parts[1].precision.sum() / np.sqrt(4.0 * np.pi)
+    np.testing.assert_allclose(found, [0.0, expected, 0.0, 0.0], rtol=1e-5, atol=1e-5 * expected)
+
+
+def test_ranges_end_at_the_edges_and_the_widest_are_halved() -> None:
+    found = ranges_within(EDGES, 8)
+    assert len(found) == 8
+    assert {low for low, _ in found} >= set(EDGES[:-1])
+    assert [low for low, _ in found[1:]] == [high + 1 for _, high in found[:-1]]
+    assert found[-1] == (59, 64)
+
+
+def test_of_more_ranges_than_asked_for_those_of_the_fewest_modes_are_joined() -> None:
+    assert ranges_within(EDGES, 4) == [(2, 32), (33, 43), (44, 53), (54, 64)]
+    assert ranges_within(EDGES, 1) == [(2, 64)]
+
+
+def test_no_range_is_less_than_a_degree() -> None:
+    assert ranges_within((2, 4), 9) == [(2, 2), (3, 3)]
