@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.special import poch
 
 from mcsim.reconstruction.forms import REFERENCE_GHZ
@@ -21,6 +22,7 @@ from mcsim.reconstruction.scores import (
     MODULATION,
     MONTH,
     ORDERS,
+    TURNED,
     Key,
     Scene,
     View,
@@ -32,6 +34,8 @@ from mcsim.support.arrays import Matrix, Vector
 ALIKE, OPPOSITE = "alike", "opposite"
 
 FREE = 5  #: coordinates of a pattern on the sky whose responses are simulated one by one, at most
+
+LOBE = 2  #: highest degree and spin of what a lobe sees
 
 ANY = f"1-{HARMONICS}"  #: of a wave in any way: a constant and all harmonics
 
@@ -153,7 +157,7 @@ def _of_maps(scene: Scene) -> Iterator[Structure]:
             kept = [i for i in views if factors[scene.views[i].split] != 0.0]
             weights = np.array([factors[scene.views[i].split] for i in kept])
             for stage, acts_on, frame, kind, keys, mix in _forms(scene, split, kept):
-                if name is None and (frame == "sky" or stage in ("square", "cube")):
+                if name is None and (_fixed(frame, kind) or stage in ("square", "cube")):
                     if stage != "added" or kind not in ALSO_COMMON:
                         continue  # what all channels see alike is the sky itself, which the model knows as random
                     stage, frame = ("power", "") if split == ALIKE else (stage, frame)
@@ -163,6 +167,11 @@ def _of_maps(scene: Scene) -> Iterator[Structure]:
     yield from _modulations(scene)
     if len({f for f in scene.frequencies if f is not None}) > 1 and None not in scene.frequencies:
         yield from _scaled(scene)
+
+
+def _fixed(frame: str, kind: str) -> bool:
+    """Return True for a pattern fixed to the sky that does not turn with the beam."""
+    return frame == "sky" and not kind.startswith("orientation")
 
 
 def _splits(splits: Sequence[str]) -> Iterator[tuple[str, tuple[float, ...]]]:
@@ -181,10 +190,9 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
     """Yield stage, what it acts on, frame, kind, keys without the map, and mix."""
     view = scene.views[kept[0]]
     yield from _added(scene)
+    yield from _turned(scene, view)
     lobe: list[Key] = [("lobe", 0), ("lobe", 1), ("dipole",)]
     yield "added", "dipole", "spacecraft", "lobe", lobe, None
-    if len(view.w) > 1:
-        yield "added", "", "spacecraft", "Galaxy", [("added", 0), *(("Galaxy", k) for k in range(5))], None
     for name in view.elsewhere:
         if all(name in scene.views[i].elsewhere for i in kept):
             for on in ACTED_ON[:2]:
@@ -254,6 +262,29 @@ def _added(scene: Scene) -> Iterator[_Form]:
     keys: list[Key] = [("added", j) for j in range((scene.degree + 1) ** 2)]
     for kind, zonal in _latitudes(scene.frame, scene.degree):
         yield "added", "", "sky", kind, keys, zonal
+
+
+def _turned(scene: Scene, view: View) -> Iterator[_Form]:
+    """Yield patterns of few degrees that turn with the beam: of one spin, and those of all as a lobe makes them."""
+    for s in view.spins:
+        for top, degrees in ((s, f"degree {s}"), (TURNED[s], f"degrees {s}-{TURNED[s]}")):
+            yield "added", "", "sky", f"orientation {s} {degrees}", _turning(s, top), None
+    if len(view.spins) == LOBE:
+        every: list[Key] = [("added", j) for j in range((LOBE + 1) ** 2)]
+        every += [key for s in view.spins for key in _turning(s, LOBE)]
+        yield "added", "", "spacecraft", f"degrees 0-{LOBE}", every, None
+        yield "added", "", "spacecraft", "Galaxy", every, _galaxy(scene.frame)
+
+
+def _turning(s: int, top: int) -> list[Key]:
+    return [("turned", s, p, j) for p in (0, 1) for j in range(s**2, (top + 1) ** 2)]
+
+
+def _galaxy(frame: str) -> Matrix:
+    """Return a constant and the quadrupole about the galactic pole, of E and B of every spin up to LOBE."""
+    quadrupole = real.zonal(rotation_matrix(frame, "galactic")[2], LOBE)[LOBE]
+    fields = [quadrupole, *(quadrupole[s**2 :] for s in range(1, LOBE + 1) for _ in (0, 1))]
+    return np.vstack([np.eye(1, sum(map(len, fields))), block_diag(*fields)])
 
 
 def _latitudes(frame: str, top: int) -> list[tuple[str, Matrix]]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mcsim.reconstruction.forms import FORMS, Form
-from mcsim.reconstruction.grammar import ALIKE, ANY, OPPOSITE, Structure
+from mcsim.reconstruction.grammar import ALIKE, ANY, LOBE, OPPOSITE, Structure
 from mcsim.reconstruction.scores import ELSEWHERE, MONTH, Scene
 from mcsim.support.arrays import Vector
 
@@ -105,6 +105,8 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
     if structure.frame in ("spacecraft", "time", "Sun"):
         timed |= _wave(structure)
     match structure.stage, structure.frame:
+        case "added", "sky" if structure.kind.startswith("orientation"):
+            return "AddedToSamples", {"wave": "sky", "spins": (int(structure.kind.split()[1]),), **timed}
         case "added", "sky" if structure.kind != "power":
             if alike:
                 return "AddedPattern", {"coefficients": pattern, "index": structure.index or 0.0}
@@ -158,6 +160,8 @@ def _wave(structure: Structure) -> dict[str, Any]:
         return {"wave": "Sun"} if wave == "dipole" else {"wave": "spin", "harmonic": 0}
     if structure.stage == "added" and structure.acts_on == "dipole":
         return {"wave": "lobe"}
+    if wave in ("Galaxy", "degrees"):
+        return {"wave": "sky", "spins": tuple(range(LOBE + 1))}
     if wave == "month":
         return {"wave": "year", "harmonic": MONTH[0]}
     return {"wave": wave, "harmonic": int(rest)} if rest.isdigit() else {"wave": wave, "harmonic": 0}
@@ -169,8 +173,6 @@ def _numbers(structure: Structure, theta: Vector) -> tuple[float, ...]:
         cosines = np.stack([theta, np.zeros_like(theta)], axis=1).ravel()
         waves = cosines if structure.kind == "elongation" else np.insert(theta, 1, 0.0)
         return (float(waves[0]) / CONSTANT, *map(float, waves[1:]))
-    if structure.kind == "Galaxy":
-        return float(theta[0]) / CONSTANT, *map(float, theta[1:])
     found = theta if structure.mix is None else structure.mix.T @ theta
     return tuple(
         map(float, np.append(0.0, found) if structure.frame != "Sun" and structure.kind == "dipole" else found)

@@ -19,7 +19,6 @@ from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.reconstruction.forms import boosts, rotations
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
-from mcsim.sphere.rotation import rotation_matrix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Alm, Cl, Map, Matrix, Vector, divided
 from mcsim.systematics.spacecraft import axes
@@ -27,6 +26,7 @@ from mcsim.systematics.spacecraft import axes
 ADDED, GAIN = 8, 4  #: highest degree of patterns that are added, and of those that multiply
 ORDERS = 4  #: highest order of a beam, and of what follows its orientation
 MODULATION = 2  #: highest degree of patterns that multiply the sky itself
+TURNED = {1: 3, 2: 4}  #: highest degree of patterns on the sky that turn with the beam, by their spin
 ELONGATION = 6  #: highest harmonic of the spin phase in what depends on the distance from the Sun
 MONTH = (12, 14)  #: harmonics of the year that a month is made of, from 26 to 30 days
 HARMONICS = 4  #: highest harmonic of spin phase, year and orientation that is said by itself
@@ -52,6 +52,11 @@ class View:
     precision: Map  #: one over the variance of the noise
     response: Cl  #: B_l w_l of the channel, shape (lmax + 1,)
     kernel: Cl  #: b_l0 of its beam, shape (lmax + 1,)
+
+    @property
+    def spins(self) -> tuple[int, ...]:
+        """Return the spins of patterns that turn with the beam, as far as its orientations are known."""
+        return tuple(s for s in TURNED if s <= len(self.w))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +119,8 @@ class Scene:
             for kind in ("gain of the sky", "gain"):
                 found += [(kind, i, j) for j in range((min(GAIN, self.lmax) + 1) ** 2)]
             found += [(kind, i) for kind in ("dipole", "square of the sky", "square", "cube")]
-            found += [("Galaxy", i, k) for k in range(5 if len(view.w) > 1 else 0)]
+            for s in view.spins:
+                found += [("turned", i, s, p, j) for p in (0, 1) for j in range(s**2, (TURNED[s] + 1) ** 2)]
             found += [("lobe", i, 0), ("lobe", i, 1), *(("rotation", i, axis) for axis in range(3))]
             every = [(name, c) for name, maps in view.waves.items() for c in range(len(maps))]
             found += [(on, i, name, c) for on in ("", *ACTED_ON) for name, c in every]
@@ -154,7 +160,7 @@ class Scene:
             top = min(GAIN, self.lmax)
             found += [self._without_dipole(r, sky, adjoint, top), _low(r * whole, top)]
             found.append(np.array([r @ self.dipole, r @ sky**2, r @ whole**2, r @ whole**3]))
-            found += [self._galaxy(r, view), np.array(self._lobe(r, view))]
+            found += [*_turned(r, view), np.array(self._lobe(r, view))]
             through = (alm_.multiply(one, view.response, self.lmax) for one in turned)
             found.append(np.array([_product(adjoint, one, self.lmax) for one in through]))
             every = [one for maps in view.waves.values() for one in maps]
@@ -176,19 +182,6 @@ class Scene:
         south, east = self._tangent
         c, s = view.w[0].real, -view.w[0].imag  # means of cos psi and sin psi
         return float(r @ (c * south + s * east)), float(r @ (c * east - s * south))
-
-    def _galaxy(self, r: Map, view: View) -> Vector:
-        """Return the scores of the quadrupole about the galactic pole, as a lobe that turns with the beam sees it."""
-        if len(view.w) < 2:
-            return np.zeros(0)
-        frame = axes(*healpy.pix2ang(self.nside, np.arange(12 * self.nside**2)))
-        pole = rotation_matrix(self.frame, "galactic")[2]
-        outward, south, east = (pole @ one for one in frame)
-        (c, c2), (s, s2) = view.w[:2].real, -view.w[:2].imag
-        plus, cross = south**2 - east**2, 2.0 * south * east
-        turned = [c2 * plus + s2 * cross, c2 * cross - s2 * plus]
-        turned += [outward * (c * south + s * east), outward * (c * east - s * south), outward**2 - 1.0 / 3.0]
-        return np.array(turned) @ r
 
     @cached_property
     def _tangent(self) -> tuple[Map, Map]:
@@ -261,6 +254,15 @@ class Scene:
 def coarse(nside: int) -> int:
     """Return the nside of the pixels of what is seen elsewhere."""
     return min(nside, ELSEWHERE // 2)
+
+
+def _turned(r: Map, view: View) -> list[Vector]:
+    """Return the scores of Q cos s psi + U sin s psi, of E and then B of every spin s."""
+    found = []
+    for s in view.spins:
+        both = healpix.adjoint(r * np.stack([view.w[s - 1].real, -view.w[s - 1].imag]), TURNED[s], spin=s)
+        found += [real.coefficients(one, TURNED[s], TURNED[s])[s**2 :] for one in both]
+    return found
 
 
 def _low(product: Map, top: int) -> Vector:

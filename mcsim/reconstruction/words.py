@@ -55,12 +55,18 @@ def _what(structure: Structure, theta: Vector) -> str:
     kind, number = structure.kind, structure.kind.rpartition(" ")[2]
     on = structure.acts_on.replace("sky and dipole", "sky and dipole alike")
     match structure.stage, structure.frame:
+        case "added", "sky" if kind.startswith("orientation"):
+            _, order, degrees = kind.split(maxsplit=2)
+            turns = f"turns with the beam (order {order}, {_pattern(degrees)})"
+            return f"is added to the signal, fixed to the sky, and {turns}"
         case "added", "sky":
             return f"is added to the signal, fixed to the sky ({_pattern(kind)})"
         case "added", "spacecraft" if kind == "lobe":
             return f"is the dipole as a lobe fixed to the spacecraft sees it, {_lobe(theta)}"
         case "added", "spacecraft" if kind == "Galaxy":
             return "is added to the signal as the Galaxy is in a lobe fixed to the spacecraft"
+        case "added", "spacecraft" if kind.startswith("degrees"):
+            return f"is added to the signal as a sky ({_pattern(kind)}) is in a lobe fixed to the spacecraft"
         case "added", "Sun":
             return f"is added to the signal and depends on {SUN[kind]}"
         case "added", "spacecraft" if kind.startswith("line"):

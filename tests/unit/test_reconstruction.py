@@ -95,6 +95,9 @@ TOLERANCE = {
         ("elsewhere", "spacecraft", "opposite", ALIKE),
         ("elsewhere", "spacecraft", "lag", ALIKE),
         ("added", "spacecraft", "Galaxy", "half1"),
+        ("added", "spacecraft", "degrees 0-2", "half2"),
+        ("added", "sky", "orientation 1 degree 1", ALIKE),
+        ("added", "sky", "orientation 2 degrees 2-4", "opposite"),
         ("added", "time", "month", ALIKE),
         ("elsewhere", "spacecraft", "spin -1/4", ALIKE),
         ("beam", "scan", "order 0", ALIKE),
@@ -164,6 +167,23 @@ def test_another_channel_sees_the_dipole_where_its_line_of_sight_points():
     time_s = sites[1].pointing.model.period_of_samples(sites[1].pointing.line) * np.arange(1000, 1050)
     expected = sites[1].dipole_uk @ healpy.ang2vec(*other[:2]).T
     np.testing.assert_allclose(effect.signal(time_s, *own, sites[1]), expected, atol=1e-6)
+
+
+def test_a_direction_along_the_beam_is_a_pattern_of_spin_1():
+    """b . x with a fixed vector b is the gradient of b . n along x, thus E of degree 1: Q = b . e_theta."""
+    site = survey(seen()[0]).channels[1].site
+    b, draw = np.array([0.5, 0.3, 0.81]), np.random.default_rng(1).uniform(size=(3, 2000))
+    theta, phi, psi = np.arccos(1.0 - 2.0 * draw[0]), 2.0 * np.pi * draw[1], 2.0 * np.pi * draw[2]
+    _, south, east = spacecraft.axes(theta, phi)
+    structure = next(w for w in grammar() if w.kind == "orientation 1 degree 1" and w.channel == "W1")
+    expected = b @ (np.cos(psi) * south + np.sin(psi) * east)
+    made = [
+        plugin("unlisted_1", structure, theta_, seen()[1]).kind()(amplitude=1.0).signal(psi, theta, phi, psi, site)
+        for theta_ in np.eye(6)
+    ]
+    fitted = np.linalg.lstsq(np.array(made).T, expected, rcond=None)[0]
+    np.testing.assert_allclose(fitted @ made, expected, atol=0.02)
+    np.testing.assert_allclose(fitted[3:], 0.0, atol=0.01 * np.abs(fitted).max())
 
 
 def test_orientations_are_those_of_the_pointing():
