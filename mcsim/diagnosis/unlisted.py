@@ -15,12 +15,12 @@ from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.words import refuted
 from mcsim.reconstruction import words
-from mcsim.reconstruction.grammar import ALIKE, Structure, structures
+from mcsim.reconstruction.grammar import ALIKE, Structure
 from mcsim.reconstruction.plugin import Plugin, plugin
 from mcsim.reconstruction.result import NSIDE, WORDS, Reconstructed
 from mcsim.reconstruction.scores import Scene
 from mcsim.reconstruction.search import Search
-from mcsim.reconstruction.simulated_scores import null_scores, scene_for, scores_of_maps
+from mcsim.reconstruction.simulated_scores import scene_for, scores_of_maps, search_of, with_peaks
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Map, Matrix, Vector
@@ -36,8 +36,7 @@ def reconstructed(result: DiagnosisResult, data: ObservedMaps, ask: Ask) -> Diag
     """Return the result with what is missing in the words of the grammar; ``ask`` simulates with :func:`scores`."""
     analysis = data.context.analysis
     scene = scene_for(analysis.job(analysis.run))
-    search = Search(structures(scene), null_scores(analysis, ask))
-    found, reduction = structures_of(data, scene, search)
+    found, reduction = structures_of(data, scene, search_of(analysis, scene, ask), ask)
     if reduction is not None and reduction.refutes(analysis.settings.reduction_sigma):
         what = " and ".join(one.says for one in found)
         note = f"What {what} fits best, and is not what is missing: {refuted(reduction)}."
@@ -45,9 +44,12 @@ def reconstructed(result: DiagnosisResult, data: ObservedMaps, ask: Ask) -> Diag
     return replace(result, unlisted=found, unlisted_held_out=reduction)
 
 
-def structures_of(data: ObservedMaps, scene: Scene, search: Search) -> tuple[tuple[Reconstructed, ...], HeldOut | None]:
+def structures_of(
+    data: ObservedMaps, scene: Scene, search: Search, ask: Ask
+) -> tuple[tuple[Reconstructed, ...], HeldOut | None]:
     """Return the structures that are found in maps, and how far they reduce the excess on held-out data."""
     analysis = data.context.analysis
+    scene, search = with_peaks(analysis, scene, search, data.data, ask)
     x = scores_of_maps(analysis.model, scene, data.data)
     made = Reconstruction(data, scene, search, x)
     found = search.run(x, made)

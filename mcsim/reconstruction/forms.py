@@ -174,10 +174,12 @@ class BeamOrder(Form):
 class InTime(Form):
     """Derive forms that depend on time from this class."""
 
-    #: "": constant; "spin", "year", "orientation": ``harmonic`` times spin phase, year or psi; "trend": from -1 to 1
-    #: through the survey; of what is added also "sky": a pattern, and those of :meth:`AddedToSamples.components`
+    #: "": constant; "spin", "year", "orientation": ``harmonic`` times spin phase, year or psi; "period": ``period_s``
+    #: from the start of the survey on; "trend": from -1 to 1 through the survey; of what is added also "sky": a
+    #: pattern, and those of :meth:`AddedToSamples.components`
     wave: ClassVar[str] = ""
     harmonic: ClassVar[int] = 1
+    period_s: ClassVar[float]
     #: of cosine and sine, of this and of each further harmonic, or of the pattern, or of components, or the constant
     coefficients: ClassVar[tuple[float, ...]]
     splits: ClassVar[tuple[float, ...]] = (1.0,)  #: factor in each of as many equal parts of the survey's time
@@ -201,6 +203,8 @@ class InTime(Form):
             phase = spin_phase(pointing, time_s)
         elif self.wave == "year":
             phase = 2.0 * np.pi * time_s / pointing.model.orbit_period_s
+        elif self.wave == "period":
+            phase = 2.0 * np.pi * time_s / self.period_s
         else:
             phase = orientation(pointing, time_s, site.frame) if psi is None else psi
         found = np.zeros(len(time_s))

@@ -66,6 +66,7 @@ class Structure:
     #: matrix from these sums to the coordinates, shape (coordinates, K); None: they are the coordinates
     mix: Matrix | None = field(default=None, repr=False)
     views: tuple[int, ...] = field(default=(), repr=False)  #: indices of the maps
+    tried: float = 1.0  #: number of such structures among which the data have chosen it
 
     @property
     def size(self) -> int:
@@ -112,7 +113,7 @@ class Structure:
         """Return the same, measured in the maps of one split; ``splits`` are those of all maps."""
         kept = [k for k, view in enumerate(self.views) if splits[view] == split]
         return Structure(
-            *self.says, self.rows[:, kept], self.weights[kept], self.mix, tuple(self.views[k] for k in kept)
+            *self.says, self.rows[:, kept], self.weights[kept], self.mix, tuple(self.views[k] for k in kept), self.tried
         )
 
 
@@ -162,7 +163,8 @@ def _of_maps(scene: Scene) -> Iterator[Structure]:
                         continue  # what all channels see alike is the sky itself, which the model knows as random
                     stage, frame = ("power", "") if split == ALIKE else (stage, frame)
                 rows = _rows(scene, keys, kept)
-                yield Structure(stage, acts_on, frame, kind, name, split, None, rows, weights, mix, tuple(kept))
+                tried = scene.time_lines[0].tried if kind.startswith("period") else 1.0
+                yield Structure(stage, acts_on, frame, kind, name, split, None, rows, weights, mix, tuple(kept), tried)
         yield from _high_orders(scene, name, views)
     yield from _modulations(scene)
     if len({f for f in scene.frequencies if f is not None}) > 1 and None not in scene.frequencies:
@@ -237,7 +239,7 @@ def _timed(scene: Scene, view: View, on: str) -> Iterator[_Form]:
     waves: dict[str, list[Key]] = {name: [(on, name, c) for c in range(len(own))] for name, own in view.waves.items()}
     for name, keys in waves.items():
         wave, _, harmonic = name.partition(" ")
-        if wave != "Sun" and int(harmonic or 1) <= HARMONICS:
+        if wave == "period" or (wave != "Sun" and int(harmonic or 1) <= HARMONICS):
             yield stage, on, "spacecraft" if wave == "orientation" else "time", name, keys, None
     if not scene.timed or on in ACTED_ON[1:]:
         return

@@ -164,6 +164,8 @@ def _wave(structure: Structure) -> dict[str, Any]:
         return {"wave": "sky", "spins": tuple(range(LOBE + 1))}
     if wave == "month":
         return {"wave": "year", "harmonic": MONTH[0]}
+    if wave == "period":
+        return {"wave": wave, "period_s": float(rest)}
     return {"wave": wave, "harmonic": int(rest)} if rest.isdigit() else {"wave": wave, "harmonic": 0}
 
 

@@ -17,6 +17,7 @@ from scipy.sparse import csr_matrix
 
 from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.reconstruction.forms import boosts, rotations
+from mcsim.reconstruction.periods import Peak, TimeLine
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
 from mcsim.sphere.sky import dipole_alm
@@ -80,6 +81,7 @@ class Scene:
     #: directions elsewhere in the frame of each channel's beam (x, y, outward) with weights, shape (n, 4), by what
     #: is there, if it is known when and how every sample was pointed, and splits are spans of time; else none
     elsewhere: tuple[Mapping[str, Matrix], ...]
+    time_lines: tuple[TimeLine, ...]  #: of every channel, if the pointing of every sample is known; else none
 
     @property
     def timed(self) -> bool:
@@ -147,6 +149,13 @@ class Scene:
         """Return the real harmonics up to degree GAIN in every pixel, shape ((GAIN + 1)^2, npix)."""
         n = healpy.pix2vec(self.nside, np.arange(12 * self.nside**2))
         return np.stack([real.field(unit, *n) for unit in np.eye((GAIN + 1) ** 2)])
+
+    def peaks(self, filtered: FilteredMaps) -> dict[tuple[int, str], Peak]:
+        """Return the largest peak in the residuals of every channel, by it and by what the wave acts on."""
+        residual, whole = filtered.residual, filtered.expected + self.dipole
+        products = {"": residual, ACTED_ON[0]: residual * whole}
+        each = ((c, on) for c in range(len(self.time_lines)) for on in products)
+        return {(c, on): self.time_lines[c].peak(on, [products[on][i] for i in self.of(c)]) for c, on in each}
 
     def values(self, filtered: FilteredMaps) -> Vector:
         """Return the scores, shape (len(keys),)."""

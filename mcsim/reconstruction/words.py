@@ -139,6 +139,13 @@ def _wave(kind: str) -> str:
         return "time, growing steadily"
     if wave == "month":
         return "month"
+    if wave == "period":
+        seconds, name = float(harmonic), "day"
+        for unit, size in (("day", 86400.0), ("hour", 3600.0), ("minute", 60.0)):
+            name, number = unit, seconds / size
+            if number >= 2.0:
+                break
+        return f"time, with a period of {number:.4g} {name}s"
     often = {ANY: ", in any way", "1": ""}.get(harmonic, f", {_TIMES.get(harmonic)} a {wave}")
     return ("year" if wave == "year" else "spin phase") + often
 

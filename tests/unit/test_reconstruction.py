@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
+from types import SimpleNamespace
 
 import healpy
 import numpy as np
@@ -39,7 +40,7 @@ def seen():
     run = config.load(MODEL)
     model = model_of(survey(run, orders=4), DiagnosisSettings())
     maps = list(simulate.maps(model.survey, 7))
-    scene = simulated_scores.scene_of(model)
+    scene = simulated_scores.with_periods(model, simulated_scores.scene_of(model), [5640.0])
     return run, scene, wiener_filter(model, maps), simulated_scores.scores_of_maps(model, scene, maps)
 
 
@@ -99,6 +100,8 @@ TOLERANCE = {
         ("added", "sky", "orientation 1 degree 1", ALIKE),
         ("added", "sky", "orientation 2 degrees 2-4", "opposite"),
         ("added", "time", "month", ALIKE),
+        ("added", "time", "period 5640.0", "half2"),
+        ("gain", "time", "period 5640.0", ALIKE),
         ("elsewhere", "spacecraft", "spin -1/4", ALIKE),
         ("beam", "scan", "order 0", ALIKE),
         ("beam", "scan", "order 1", ALIKE),
@@ -194,6 +197,36 @@ def test_orientations_are_those_of_the_pointing():
         expected = pointing(site.pointing.model, site.pointing.line, 1000, 50, frame)[2]
         found = spacecraft.orientation(site.pointing, time_s, frame)
         np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * expected), atol=1e-7)
+
+
+def test_a_period_that_stands_out_is_searched(monkeypatch):
+    """A wave in the samples of one channel adds its period to the words; maps of the model add none."""
+    run, scene, _, _ = seen()
+    model = model_of(survey(run, orders=4), DiagnosisSettings())
+    simulations = np.random.default_rng(3).normal(size=(400, len(scene.keys)))
+    asked = []
+
+    def null_scores(analysis, ask, periods_s):
+        asked.append(periods_s)
+        return simulations
+
+    monkeypatch.setattr(simulated_scores, "null_scores", null_scores)
+    search = Search(grammar(), simulations, np.random.default_rng(4).normal(size=(400, 4)) - 3.0)
+    analysis = SimpleNamespace(model=model)
+    maps = list(simulate.maps(model.survey, 8))
+    assert simulated_scores.with_peaks(analysis, scene, search, maps, None) == (scene, search)
+    period = 7321.0
+    waves = simulated_scores.with_periods(model, scene, [period])
+    for i in (2, 3):
+        wave = waves.views[i].waves[f"period {period!r}"][0]
+        maps[i] = maps[i] + 12.0 * wave / np.sqrt(np.sum(model.parts[i].precision * wave**2))
+    more, wider = simulated_scores.with_peaks(analysis, scene, search, maps, None)
+    found = asked[-1][0]  # the most evident; a gain may be told by side bands of the same wave
+    assert abs(1.0 / found - 1.0 / period) < 0.25 / scene.time_lines[1].duration_s
+    assert f"period {found!r}" in more.views[2].waves
+    words_ = [w for w in wider.grammar if w.kind == f"period {found!r}"]
+    assert {w.channel for w in words_} == {"V1", "W1", None}
+    assert all(w.tried == scene.time_lines[0].tried for w in words_)
 
 
 @pytest.mark.parametrize("on_sky", [True, False])
@@ -326,6 +359,19 @@ def test_what_is_there_is_found_with_its_size():
     assert abs(sigma[0, 0] * covariance[2, 2] - 1.0) < 5.0 * np.sqrt(2.0 / 400)
     response = (x - simulations.mean(axis=0)) / 2.0
     assert np.allclose(search.amplitudes([chosen[2]], x, response[None]), [2.0])
+
+
+def test_a_choice_among_many_is_charged():
+    """Odds of one among n are shared by all, and what others had been chosen in simulations counts in p-values."""
+    chosen, simulations, _ = toy(400)
+    among = tuple(replace(one, tried=1e4) for one in chosen)
+    x = 20.0 * simulations[0]
+    plain_, charged = (Search(one, simulations).evidences(x) for one in (chosen, among))
+    np.testing.assert_allclose(plain_ - charged, np.log(1e4))
+    search = Search(chosen, simulations)
+    wider = replace(search, peaks=np.full((400, 1), search.largest.max() + 1.0))
+    assert search.pvalue(float(search.largest.max()) + 0.5) < 1.0 / 400
+    assert wider.pvalue(float(search.largest.max()) + 0.5) == 1.0
 
 
 def test_evidence_falls_with_the_number_of_coordinates():
