@@ -257,8 +257,8 @@ def _timed(scene: Scene, view: View, on: str) -> Iterator[_Form]:
 
 def _added(scene: Scene) -> Iterator[_Form]:
     """Yield patterns on the sky that are added: of few degrees, and zonal ones."""
-    yield "added", "", "sky", "monopole", [("added", 0)], None
-    yield "added", "", "sky", "dipole", [("added", j) for j in (1, 2, 3)], None
+    for degree, kind in enumerate(("monopole", "dipole", "quadrupole")):
+        yield "added", "", "sky", kind, [("added", j) for j in range(degree**2, (degree + 1) ** 2)], None
     for degree in sorted({min(top, scene.degree) for top in (1, 2, 4, scene.degree)}):
         yield "added", "", "sky", f"degrees 0-{degree}", [("added", j) for j in range((degree + 1) ** 2)], None
     keys: list[Key] = [("added", j) for j in range((scene.degree + 1) ** 2)]
@@ -292,7 +292,8 @@ def _galaxy(frame: str) -> Matrix:
 def _latitudes(frame: str, top: int) -> list[tuple[str, Matrix]]:
     """Return the real coefficients of patterns of one latitude alone, by what they are called."""
     poles = {name: rotation_matrix(frame, name)[2] for name in ("ecliptic", "galactic")}
-    return [(f"latitude {name}", real.zonal(pole, top)) for name, pole in poles.items()]
+    zonal = {f"latitude {name}": real.zonal(pole, top) for name, pole in poles.items()}
+    return [*((f"{name} 0-2", each[:3]) for name, each in zonal.items() if top > 2), *zonal.items()]
 
 
 def _beam(scene: Scene, s: int) -> list[Key]:

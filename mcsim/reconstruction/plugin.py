@@ -176,9 +176,8 @@ def _numbers(structure: Structure, theta: Vector) -> tuple[float, ...]:
         waves = cosines if structure.kind == "elongation" else np.insert(theta, 1, 0.0)
         return (float(waves[0]) / CONSTANT, *map(float, waves[1:]))
     found = theta if structure.mix is None else structure.mix.T @ theta
-    return tuple(
-        map(float, np.append(0.0, found) if structure.frame != "Sun" and structure.kind == "dipole" else found)
-    )
+    lower = {"dipole": 1, "quadrupole": 4}.get(structure.kind, 0) if structure.frame != "Sun" else 0
+    return tuple(map(float, np.append(np.zeros(lower), found)))
 
 
 def _factors(split: str, splits: Sequence[str]) -> tuple[float, ...]:

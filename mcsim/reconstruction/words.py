@@ -117,7 +117,8 @@ def _order(order: int, theta: Vector) -> str:
 def _pattern(kind: str) -> str:
     first, _, rest = kind.partition(" ")
     if first == "latitude":
-        return f"by {rest} latitude"
+        pole, _, degrees = rest.partition(" ")
+        return f"by {pole} latitude" + (f", {_pattern(f'degrees {degrees}')}" if degrees else "")
     if first in ("degrees", "degree"):
         return f"ℓ {rest.replace('-', '–')}"
     return {"power": "pattern not known, by its power in ℓ"}.get(kind, kind)

@@ -77,6 +77,8 @@ TOLERANCE = {
         ("added", "sky", "degrees 0-4", "half2"),
         ("added", "sky", "dipole", "opposite"),
         ("added", "sky", "latitude galactic", ALIKE),
+        ("added", "sky", "latitude ecliptic 0-2", "half1"),
+        ("added", "sky", "quadrupole", ALIKE),
         ("added", "spacecraft", "orientation 1", ALIKE),
         ("added", "spacecraft", "orientation 2", "half1"),
         ("added", "time", "year 1", ALIKE),
