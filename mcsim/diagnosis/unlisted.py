@@ -11,6 +11,7 @@ from mcsim import config
 from mcsim.datavector.analysis import simulated_maps
 from mcsim.datavector.campaign import Ask, constrained_jobs
 from mcsim.datavector.halves import Halves
+from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.words import refuted
@@ -171,11 +172,25 @@ class Reconstruction:
                 shape, share = replace(structure, split=ALIKE), np.zeros(len(self.scene.views))
                 share[list(structure.views)] = structure.weights
             effects = [plugin("unlisted", shape, one, self.scene) for one in each]
-            if None not in effects:
+            if structure.moving:
+                found[row] = self._moved(structure, theta)[None]
+            elif None not in effects:
                 rows = [self.simulated([one], share).scores for one in effects if one is not None]
                 found[row] = np.stack(rows) - self.before.scores
             self._trial[k] = each, found[row]
         return found
+
+    def _moved(self, structure: Structure, theta: Vector) -> Vector:
+        """Return what a beam that follows a wave makes of all scores, on skies that the data constrain."""
+        analysis, share = self.data.context.analysis, np.zeros((len(self.scene.views), 1))
+        share[list(structure.views), 0] = structure.weights
+        plain = constrained_jobs(analysis, [], self.data.same_skies.observed, range(SKIES))[0]
+        found = []
+        for maps in simulated_maps(plain):
+            sky = wiener_filter(analysis.model, maps).sky
+            added = share * self.scene.moved(structure.moving, structure.order, theta, sky)
+            found.append(scores_of_maps(analysis.model, self.scene, list(np.add(maps, added))))
+        return np.asarray(np.mean(found, axis=0) - self.before.scores)
 
     def keep(self, member: int, amplitudes: Vector) -> None:
         """Keep the coordinates that these amplitudes of the responses mean, and what they make of the scores."""

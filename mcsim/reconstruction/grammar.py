@@ -95,6 +95,17 @@ class Structure:
         return other.stage in stage and other.kind == mean and alike
 
     @property
+    def order(self) -> int:
+        """Return the order of a change of the beam."""
+        return int(self.kind.split()[1])
+
+    @property
+    def moving(self) -> str:
+        """Return the wave that a beam follows, or nothing."""
+        rest = self.kind.split(maxsplit=2)[2:] if self.stage == "beam" else []
+        return rest[0] if rest and rest[0].startswith(("spin", "year")) else ""
+
+    @property
     def by_coordinate(self) -> bool:
         """Return True for a pattern of few coordinates that multiplies the sky: each has a response of its own."""
         return self.frame == "sky" and bool(self.acts_on) and self.size <= FREE
@@ -211,6 +222,8 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
     for s in range(min(scene.split_orders, len(view.w)) + 1):
         for kind, mix in _profiles(scene, s):
             yield "beam", "sky", "scan", kind, _beam(scene, s), mix
+    for wave, s in view.moves:
+        yield "beam", "sky", "scan", f"order {s} {wave}", [("moving", wave, s, c) for c in range(4 if s else 2)], None
     if split != ALIKE:
         return
     top = min(GAIN, scene.lmax)

@@ -77,8 +77,8 @@ def _literal(value: Any) -> str:
 def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plugin | None:
     """Return the effect of a structure with fitted coordinates; None if no effect of the simulator can be like it.
 
-    These are powers of unknown patterns, beams, signals from elsewhere and noise that differ between splits, and what
-    depends on time or orientation where the pointing is not known.
+    These are powers of unknown patterns, beams that follow a wave, beams, signals from elsewhere and noise that differ
+    between splits, and what depends on time or orientation where the pointing is not known.
     """
     made = _form(structure, theta, scene)
     if made is None:
@@ -128,8 +128,8 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             one = (float(theta[0]) * CONSTANT,) if structure.acts_on == "dipole" else pattern
             acting = {"on_sky": "sky" in structure.acts_on, "on_dipole": "dipole" in structure.acts_on}
             return "GainPattern", {"coefficients": one, **acting}
-        case "beam", _ if alike:
-            order = int(structure.kind.split()[1])
+        case "beam", _ if alike and not structure.moving:
+            order = structure.order
             values = tuple(map(complex, np.reshape(pattern, (-1, 2)) @ [1.0, 1j])) if order else pattern
             edges = scene.edges(max(order, 1))
             return "BeamOrder", {"order": order, "edges": edges, "top": scene.lmax, "values": values}

@@ -14,6 +14,7 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
+from scipy.special import poch
 
 from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.reconstruction.forms import boosts, rotations
@@ -28,6 +29,8 @@ ADDED, GAIN = 8, 4  #: highest degree of patterns that are added, and of those t
 ORDERS = 4  #: highest order of a beam, and of what follows its orientation
 MODULATION = 2  #: highest degree of patterns that multiply the sky itself
 TURNED = {1: 3, 2: 4}  #: highest degree of patterns on the sky that turn with the beam, by their spin
+MOVING = ("year 1", "spin 1", "spin 2")  #: waves that a beam follows
+MOVED = 2  #: highest order of a beam that follows a wave
 ELONGATION = 6  #: highest harmonic of the spin phase in what depends on the distance from the Sun
 MONTH = (12, 14)  #: harmonics of the year that a month is made of, from 26 to 30 days
 HARMONICS = 4  #: highest harmonic of spin phase, year and orientation that is said by itself
@@ -48,6 +51,8 @@ class View:
     w: NDArray[np.complex128]  #: orientation moments, shape (smax, npix)
     #: means over the samples of every pixel of what follows time or orientation: cosine and sine, and so on, by name
     waves: Mapping[str, tuple[Map, ...]]
+    #: means of cos and sin of a wave times exp(-i s psi), shape (2, npix), by the wave and s from 1 on
+    moving: Mapping[tuple[str, int], NDArray[np.complex128]]
     #: means over the samples of every coarse pixel of what they see elsewhere, shape (pixels, pixels), by name
     elsewhere: Mapping[str, csr_matrix]
     precision: Map  #: one over the variance of the noise
@@ -58,6 +63,11 @@ class View:
     def spins(self) -> tuple[int, ...]:
         """Return the spins of patterns that turn with the beam, as far as its orientations are known."""
         return tuple(s for s in TURNED if s <= len(self.w))
+
+    @property
+    def moves(self) -> tuple[tuple[str, int], ...]:
+        """Return the waves that a beam may follow, if times are known, each with its orders."""
+        return tuple((wave, s) for wave in MOVING if (wave, 1) in self.moving for s in range(MOVED + 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +137,7 @@ class Scene:
             every = [(name, c) for name, maps in view.waves.items() for c in range(len(maps))]
             found += [(on, i, name, c) for on in ("", *ACTED_ON) for name, c in every]
             found += [("elsewhere", i, name, on) for name in view.elsewhere for on in ACTED_ON[:2]]
+            found += [("moving", i, wave, s, c) for wave, s in view.moves for c in range(4 if s else 2)]
             found += [("noise", i, j) for j in range(9)]
             for s in range(min(ORDERS, len(view.w)) + 1):
                 if s <= self.split_orders or i == self.of(view.channel)[0]:
@@ -162,6 +173,7 @@ class Scene:
         found: list[NDArray[np.float64]] = []
         looked_at = filtered.sky + dipole_alm(self.dipole_uk, self.lmax)
         turned = rotations(looked_at, self.lmax)
+        bent = [self._derivatives(looked_at, self.views[self.of(c)[0]].response) for c in range(len(self.channels))]
         for i, view in enumerate(self.views):
             r, sky, adjoint = filtered.residual[i], filtered.expected[i], filtered.adjoint[i]
             whole = sky + self.dipole
@@ -178,6 +190,7 @@ class Scene:
             found += [np.array([(r * sky - lost) @ one for one in every])]
             found += [np.array([(r * self.dipole) @ one for one in every])]
             found += self._elsewhere(r, filtered.sky, view)
+            found += [_moving(r, view, wave, bent[view.channel][s], s) for wave, s in view.moves]
             found.append(0.5 * self._patterns[:9] @ divided(r**2, view.precision))
             found += list(self._orders(view, filtered.orders[i], i))
         for channel in range(len(self.channels)):
@@ -234,6 +247,35 @@ class Scene:
                 found.append(np.array([total.real, total.imag] if s else [total.real]))
         return found
 
+    def moved(self, wave: str, s: int, theta: Vector, sky: Alm) -> NDArray[np.float64]:
+        """Return what a derivative of a sky adds to every map that follows a wave, uK, shape (maps, npix).
+
+        ``theta``: coordinates of the structure, of cosine and then of sine, for s > 0 along and across the beam's x.
+        """
+        added, pairs = np.zeros((len(self.views), 12 * self.nside**2)), np.reshape(theta, (2, -1))
+        looked_at = sky + dipole_alm(self.dipole_uk, self.lmax)
+        for c in range(len(self.channels)):
+            field = self._derivatives(looked_at, self.views[self.of(c)[0]].response)[s]
+            for i in self.of(c):
+                if s == 0:
+                    means = np.tensordot(pairs[:, 0], self.views[i].waves[wave], axes=1)
+                    added[i] = field[0] * means
+                else:
+                    turned = pairs @ [1.0, -1j] @ self.views[i].moving[wave, s]
+                    added[i] = field[0] * turned.real - field[1] * turned.imag
+        return added
+
+    def _derivatives(self, alm: Alm, response: Cl) -> list[NDArray[np.float64]]:
+        """Return derivatives of a sky through a beam: l (l + 1), and E of spins up to MOVED, shape (1 or 2, npix)."""
+        ell = np.arange(self.lmax + 1.0)
+        found = []
+        for s in range(MOVED + 1 if self.timed else 0):
+            shape = np.sqrt(poch(np.maximum(ell - s + 1.0, 0.0), 2 * s)) if s else ell * (ell + 1.0)
+            electric = alm_.multiply(alm, response * shape, self.lmax)[None]
+            both = np.concatenate([electric, np.zeros_like(electric)]) if s else electric
+            found.append(healpix.synthesis(both, self.nside, self.lmax, spin=s) / self.lmax ** (s or 2))
+        return found
+
     def _powers(self, a: Alm, b: Alm) -> Vector:
         """Return the power in ranges of degrees."""
         power = np.bincount(alm_.degrees(self.lmax), _twice(self.lmax) * (a * b.conj()).real, self.lmax + 1)
@@ -272,6 +314,14 @@ def _turned(r: Map, view: View) -> list[Vector]:
         both = healpix.adjoint(r * np.stack([view.w[s - 1].real, -view.w[s - 1].imag]), TURNED[s], spin=s)
         found += [real.coefficients(one, TURNED[s], TURNED[s])[s**2 :] for one in both]
     return found
+
+
+def _moving(r: Map, view: View, wave: str, field: NDArray[np.float64], s: int) -> Vector:
+    """Return the scores of a derivative of the sky along and across the beam's x axis, times cosine and sine."""
+    if s == 0:
+        return np.array([(r * field[0]) @ one for one in view.waves[wave]])
+    q, u, w = r * field[0], r * field[1], view.moving[wave, s]
+    return np.array([f for one in w for f in (q @ one.real - u @ one.imag, u @ one.real + q @ one.imag)])
 
 
 def _low(product: Map, top: int) -> Vector:

@@ -10,6 +10,7 @@ from typing import Any
 
 import healpy
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, diags
 
 from mcsim import config
@@ -22,7 +23,18 @@ from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.reconstruction.forms import AddedToSamples
 from mcsim.reconstruction.grammar import structures
 from mcsim.reconstruction.periods import SHORTEST_S, SPANS, TimeLine
-from mcsim.reconstruction.scores import ACTED_ON, ELONGATION, HARMONICS, MONTH, ORDERS, Scene, View, coarse
+from mcsim.reconstruction.scores import (
+    ACTED_ON,
+    ELONGATION,
+    HARMONICS,
+    MONTH,
+    MOVED,
+    MOVING,
+    ORDERS,
+    Scene,
+    View,
+    coarse,
+)
 from mcsim.reconstruction.search import LEVEL, Search, evidence
 from mcsim.simulation.pixel_means import signal_of
 from mcsim.simulation.tod import samples
@@ -30,7 +42,7 @@ from mcsim.support import folders
 from mcsim.support.arrays import Map, Matrix, Vector, divided
 from mcsim.support.code import package_digest
 from mcsim.systematics import Pointing
-from mcsim.systematics.spacecraft import axes
+from mcsim.systematics.spacecraft import axes, spin_phase
 
 SIMULATIONS = 400
 """Of the model, for mean and covariance of the scores: as many realizations more, once for each model, and once for
@@ -85,7 +97,8 @@ def scene_of(model: Model) -> Scene:
         grid = MapGrid(model.nside, model.frame, run.map.span(split))
         seen = _elsewhere(channel.site.pointed("elsewhere"), grid, elsewhere[part.channel]) if timed else {}
         response = model.response[part.channel]
-        views.append(View(part.channel, split, moments, waves, seen, part.precision, response, kernel))
+        moving = _moving(channel.site.pointed("a beam"), grid) if timed else {}
+        views.append(View(part.channel, split, moments, waves, moving, seen, part.precision, response, kernel))
     return Scene(
         channels=model.channels,
         frequencies=tuple(channel.site.frequency_ghz for channel in model.survey.channels),
@@ -182,6 +195,23 @@ def _elsewhere(pointing: Pointing, grid: MapGrid, wanted: Mapping[str, Matrix]) 
             total[name] += csr_matrix((np.full(len(there), weight), (chunk.pixel, there)), total[name].shape)
     hits = total["opposite"].sum(axis=1).A1
     return {name: diags(divided(1.0, hits)) @ one for name, one in total.items()}
+
+
+def _moving(pointing: Pointing, grid: MapGrid) -> dict[tuple[str, int], NDArray[np.complex128]]:
+    """Return the mean over the samples of every pixel of cos and sin of waves times exp(-i s psi), (2, npix) each."""
+    total = {(wave, s): np.zeros((2, grid.npix), dtype=np.complex128) for wave in MOVING for s in range(1, MOVED + 1)}
+    hits = np.zeros(grid.npix)
+    for chunk in samples(*_thinned(pointing, grid, VISITS), grid):
+        year = 2.0 * np.pi * chunk.time_s / pointing.model.orbit_period_s
+        phases = {"year": year, "spin": spin_phase(pointing, chunk.time_s)}
+        hits += np.bincount(chunk.pixel, minlength=grid.npix)
+        for (wave, s), both in total.items():
+            name, harmonic = wave.split()
+            for row, function in zip(both, (np.cos, np.sin), strict=True):
+                value = function(int(harmonic) * phases[name]) * np.exp(-1j * s * chunk.psi)
+                row.real += np.bincount(chunk.pixel, value.real, grid.npix)
+                row.imag += np.bincount(chunk.pixel, value.imag, grid.npix)
+    return {key: both * divided(1.0, hits) for key, both in total.items()}
 
 
 @lru_cache(maxsize=64)

@@ -10,7 +10,7 @@ from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import Library
 from mcsim.systematics.base import scan_direction
 
-_DERIVATIVES = {2: "second derivative", 3: "third derivative", 4: "fourth derivative"}
+_DERIVATIVES = {1: "gradient", 2: "second derivative", 3: "third derivative", 4: "fourth derivative"}
 
 _LIKE: tuple[tuple[str, str, str, str], ...] = (
     ("beam", "scan", "order 0 at low l", "beam_sidelobe"), ("beam", "scan", "order 0", "beam_width"),
@@ -85,8 +85,11 @@ def _what(structure: Structure, theta: Vector) -> str:
             return f"is proportional to {on}, with a pattern fixed to the sky ({_pattern(kind)})"
         case "gain", _:
             return f"is proportional to {on}"
+        case "beam", _ if structure.moving:
+            change = "a change of the beam's width" if kind.startswith("order 0") else _derivative(structure.order)
+            return f"follows {change} that varies with the {_wave(structure.moving)}"
         case "beam", _:
-            return _order(int(kind.split()[1]), theta)
+            return _order(structure.order, theta)
         case "square", _:
             return f"follows the square of {structure.acts_on}"
         case "cube", _:
@@ -110,8 +113,11 @@ def _order(order: int, theta: Vector) -> str:
     # b_lm of a beam turned by a has the phase e^(-i m a); a displacement along x has b_l1 < 0, a stretch b_l2 > 0.
     total = complex(np.sum(theta.reshape(-1, 2) @ [1.0, 1j])) * (-1) ** order
     angle = -np.rad2deg(np.angle(total)) / order
-    name = "gradient" if order == 1 else _DERIVATIVES[order]
-    return f"follows the {name} of the sky {scan_direction(angle, 360.0 / order)}"
+    return f"follows {_derivative(order)} {scan_direction(angle, 360.0 / order)}"
+
+
+def _derivative(order: int) -> str:
+    return f"the {_DERIVATIVES[order]} of the sky"
 
 
 def _pattern(kind: str) -> str:
@@ -202,8 +208,8 @@ def _where(structure: Structure, scene: Scene) -> list[str]:
 
 def profile_ranges(structure: Structure, scene: Scene) -> list[tuple[int, int]] | None:
     """Return the ranges of degrees, both ends included, of a structure with a profile in l; None for others."""
-    if structure.stage == "beam":
-        edges = scene.edges(max(int(structure.kind.split()[1]), 1))
+    if structure.stage == "beam" and not structure.moving:
+        edges = scene.edges(max(structure.order, 1))
     elif structure.kind in ("power", "spectrum"):
         edges = scene.fine
     else:

@@ -16,6 +16,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import model_of, wiener_filter
 from mcsim.diagnosis import api
 from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan import MapGrid
 from mcsim.instrument.scan.pointing import pointing
 from mcsim.reconstruction import forms, simulated_scores, words
 from mcsim.reconstruction.figure import structure_figure
@@ -23,7 +24,7 @@ from mcsim.reconstruction.grammar import ALIKE, ANY, Structure, structures
 from mcsim.reconstruction.plugin import Plugin, plugin
 from mcsim.reconstruction.result import Reconstructed
 from mcsim.reconstruction.search import ALTERNATIVES, LEVEL, MOST, Search, evidence
-from mcsim.simulation import simulate
+from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
@@ -160,6 +161,36 @@ def test_a_rotation_moves_the_map():
         moved = (real.field(values, *(back / np.linalg.norm(back, axis=0))) - real.field(values, *n)) / angle
         found = healpix.synthesis(change[None], 8, 6)[0]
         np.testing.assert_allclose(found, moved, atol=1e-3 * np.abs(moved).max())
+
+
+@pytest.mark.parametrize("kind", ["order 0 year 1", "order 1 spin 1", "order 2 spin 2"])
+def test_a_score_of_a_beam_that_moves_is_the_product_with_its_maps(kind):
+    _, scene, filtered, u = seen()
+    structure = next(w for w in grammar() if (w.kind, w.channel, w.split) == (kind, "W1", "half2"))
+    theta = np.random.default_rng(4).normal(size=structure.size)
+    added = scene.moved(structure.moving, structure.order, theta, filtered.sky)[3]
+    np.testing.assert_allclose(filtered.residual[3] @ added, theta @ structure.of(u), rtol=1e-9)
+    assert plugin("unlisted_1", structure, theta, scene) is None
+
+
+def test_a_pointing_that_nods_moves_the_dipole():
+    """A displacement along the beam's x axis, cos(spin phase) of it, adds the dipole's change to every sample."""
+    run, scene, filtered, _ = seen()
+    site, span = survey(run).channels[1].site, run.map.span(1)
+    model, line = site.pointing.model, site.pointing.line
+
+    def change(chunk):
+        _, south, east = spacecraft.axes(chunk.theta, chunk.phi)
+        along = np.cos(chunk.psi) * south + np.sin(chunk.psi) * east
+        return np.cos(spacecraft.spin_phase(site.pointing, chunk.time_s)) * (scene.dipole_uk @ along)
+
+    stream = tod.with_signal(change)(tod.samples(model, line, MapGrid(NSIDE, "ecliptic", span)))
+    expected, hits = tod.bin_samples(stream, NSIDE)
+    (view,) = (view for view in scene.views if (view.channel, view.split) == (1, 1))
+    unit = np.array([LMAX, 0.0, 0.0, 0.0]) / view.response[1]
+    found = scene.moved("spin 1", 1, unit, np.zeros_like(filtered.sky))[3]
+    difference = (found - expected)[hits > 0]  # samples are not at the centres of pixels
+    assert np.std(difference) < 0.05 * np.std(expected[hits > 0])
 
 
 def test_another_channel_sees_the_dipole_where_its_line_of_sight_points():
