@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.special import poch
+from scipy.special import ive, poch
 
 from mcsim.reconstruction.forms import REFERENCE_GHZ
 from mcsim.reconstruction.scores import (
@@ -36,6 +36,9 @@ ALIKE, OPPOSITE = "alike", "opposite"
 FREE = 5  #: coordinates of a pattern on the sky whose responses are simulated one by one, at most
 
 LOBE = 2  #: highest degree and spin of what a lobe sees
+
+CROSSINGS, NARROW = 24, (2.0, 8.0)
+"""Of the Sun in a lobe: how many spin phases of it are tried, and which concentrations of a von Mises function."""
 
 ANY = f"1-{HARMONICS}"  #: of a wave in any way: a constant and all harmonics
 
@@ -95,6 +98,11 @@ class Structure:
         return other.stage in stage and other.kind == mean and alike
 
     @property
+    def choice(self) -> tuple[str | None, ...]:
+        """Return what is the same of structures among which the data choose; nothing for others."""
+        return (*self.says[:3], *self.says[4:6]) if self.tried > 1.0 else ()
+
+    @property
     def order(self) -> int:
         """Return the order of a change of the beam."""
         return int(self.kind.split()[1])
@@ -129,7 +137,25 @@ class Structure:
 
 
 def _briefly(kind: str) -> list[str]:
-    return kind.split()[: 1 if kind.startswith("degrees") else 2]
+    return kind.split()[: 1 if kind.startswith(("degrees", "crossing")) else 2]
+
+
+def _crossing(phase: float, narrow: float) -> Matrix:
+    """Return a constant, and cosines and sines of the spin phase, of exp(narrow cos(phase of the spin - phase)).
+
+    A lobe whose response is exponential in the cosine of the distance from its axis sees the Sun so, whose distance
+    from the spin axis is fixed: a von Mises function, of modified Bessel functions.
+    """
+    k = np.arange(1, ELONGATION + 1)
+    waves = ive(k, narrow)[:, None] * np.stack([np.cos(k * phase), np.sin(k * phase)], axis=1)
+    return np.append(ive(0, narrow) * np.sqrt(4.0 * np.pi), 2.0 * waves)[None]
+
+
+_CROSSINGS = {
+    f"crossing {360 * n // CROSSINGS} {narrow:g}": _crossing(2.0 * np.pi * n / CROSSINGS, narrow)
+    for narrow in NARROW
+    for n in range(CROSSINGS)
+}
 
 
 def structures(scene: Scene) -> tuple[Structure, ...]:
@@ -174,12 +200,19 @@ def _of_maps(scene: Scene) -> Iterator[Structure]:
                         continue  # what all channels see alike is the sky itself, which the model knows as random
                     stage, frame = ("power", "") if split == ALIKE else (stage, frame)
                 rows = _rows(scene, keys, kept)
-                tried = scene.time_lines[0].tried if kind.startswith("period") else 1.0
-                yield Structure(stage, acts_on, frame, kind, name, split, None, rows, weights, mix, tuple(kept), tried)
+                own = name, split, None, rows, weights, mix, tuple(kept), _tried(scene, kind)
+                yield Structure(stage, acts_on, frame, kind, *own)
         yield from _high_orders(scene, name, views)
     yield from _modulations(scene)
     if len({f for f in scene.frequencies if f is not None}) > 1 and None not in scene.frequencies:
         yield from _scaled(scene)
+
+
+def _tried(scene: Scene, kind: str) -> float:
+    """Return the number of structures of a kind, or of frequencies, among which the data choose."""
+    if kind.startswith("period"):
+        return scene.time_lines[0].tried
+    return float(len(_CROSSINGS)) if kind.startswith("crossing") else 1.0
 
 
 def _fixed(frame: str, kind: str) -> bool:
@@ -240,6 +273,9 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
     yield "square", "sky", "", "square", [("square of the sky",)], None
     yield "cube", "sky and dipole", "", "cube", [("cube",)], None
     yield "rotation", "sky and dipole", "sky", "rotation", [("rotation", axis) for axis in range(3)], None
+    spin: list[Key] = [("", f"spin {k}", c) for k in range(1, ELONGATION + 1) for c in (0, 1)]
+    for kind, mix in _CROSSINGS.items() if scene.timed else ():
+        yield "added", "", "Sun", kind, [("added", 0), *spin], mix
 
 
 def _timed(scene: Scene, view: View, on: str) -> Iterator[_Form]:

@@ -171,11 +171,11 @@ def _wave(structure: Structure) -> dict[str, Any]:
 
 def _numbers(structure: Structure, theta: Vector) -> tuple[float, ...]:
     """Return the real coefficients of a pattern."""
-    if structure.kind == "elongation" or structure.kind.endswith(ANY):  # from the constant on, which has no sine
-        cosines = np.stack([theta, np.zeros_like(theta)], axis=1).ravel()
-        waves = cosines if structure.kind == "elongation" else np.insert(theta, 1, 0.0)
-        return (float(waves[0]) / CONSTANT, *map(float, waves[1:]))
     found = theta if structure.mix is None else structure.mix.T @ theta
+    if structure.kind == "elongation":  # of cosines alone
+        found = np.delete(np.stack([found, np.zeros_like(found)], axis=1).ravel(), 1)
+    if structure.kind.startswith(("elongation", "crossing")) or structure.kind.endswith(ANY):  # a constant has no sine
+        return float(found[0]) / CONSTANT, 0.0, *map(float, found[1:])
     lower = {"dipole": 1, "quadrupole": 4}.get(structure.kind, 0) if structure.frame != "Sun" else 0
     return tuple(map(float, np.append(np.zeros(lower), found)))
 

@@ -193,8 +193,9 @@ class Search:
         """Return structures to compare: the most evident one, and those that may be it on this sky.
 
         These are the best of every other stage, the same in other channels, splits or profiles, whose own scores do not
-        tell all that they do to the others, those near it, and the best of every frame.
-        All their scores together have as many elements as a fraction 1/SPARE of the simulations at most.
+        tell all that they do to the others, those near it, and the best of every frame. Of many among which the data
+        choose it is the best. All their scores together have as many elements as a fraction 1/SPARE of the simulations
+        at most.
         """
         order = [k for k in map(int, np.argsort(-values)) if values[k] > 0.0]
         each = [self.grammar[k] for k in order]
@@ -210,7 +211,7 @@ class Search:
         wanted += [k for k in order if values[order[0]] - values[k] < NEAR]
         wanted += _firsts(order, [(one.stage, one.acts_on, one.frame) for one in each])
         chosen, rows = list[int](), 0
-        for k in dict.fromkeys(wanted):
+        for k in _firsts(wanted, [self.grammar[k].choice or k for k in wanted]):
             if len(chosen) < FINALISTS and rows + self.grammar[k].size <= len(self.simulations) // SPARE:
                 chosen.append(k)
                 rows += self.grammar[k].size

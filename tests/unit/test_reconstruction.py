@@ -118,6 +118,7 @@ TOLERANCE = {
         ("added", "spacecraft", "line V1", ALIKE),
         ("added", "Sun", "dipole", "half1"),
         ("added", "Sun", "elongation", ALIKE),
+        ("added", "Sun", "crossing 285 8", ALIKE),
         ("added", "spacecraft", "lobe", ALIKE),
         ("beam", "scan", "order 0 at low l", ALIKE),
         ("rotation", "sky", "rotation", ALIKE),
@@ -405,6 +406,28 @@ def test_a_choice_among_many_is_charged():
     wider = replace(search, peaks=np.full((400, 1), search.largest.max() + 1.0))
     assert search.pvalue(float(search.largest.max()) + 0.5) < 1.0 / 400
     assert wider.pvalue(float(search.largest.max()) + 0.5) == 1.0
+
+
+def test_of_many_that_the_data_choose_among_the_best_is_compared():
+    chosen, simulations, _ = toy(400)
+    among = tuple(replace(one, stage="any", tried=12.0) for one in chosen[:12])
+    search = Search((*among, *chosen[12:]), simulations)
+    values = np.arange(1.0, 15.0)
+    assert search.finalists(values)[:2] == [13, 12]
+    assert [k for k in search.finalists(values) if k < 12] == [11]
+
+
+def test_the_sun_in_a_lobe_is_a_von_mises_function():
+    """Six harmonics of exp(2 (cos x - 1)) are that function to 1e-4, and of the narrower one to 5 %."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 100)
+    for narrow, tolerance in ((2, 1e-4), (8, 0.05)):
+        structure = next(w for w in grammar() if w.kind == f"crossing 285 {narrow}")
+        constant, none, *waves = plugin("unlisted_1", structure, np.ones(1), seen()[1]).values["coefficients"]
+        assert none == 0.0
+        k = np.arange(1, len(waves) // 2 + 1)[:, None]
+        found = constant + waves[::2] @ np.cos(k * turn) + waves[1::2] @ np.sin(k * turn)
+        expected = np.exp(narrow * (np.cos(turn - np.deg2rad(285.0)) - 1.0))
+        np.testing.assert_allclose(found, expected, atol=tolerance)
 
 
 def test_evidence_falls_with_the_number_of_coordinates():
