@@ -36,6 +36,7 @@ MONTH = (12, 14)  #: harmonics of the year that a month is made of, from 26 to 3
 HARMONICS = 4  #: highest harmonic of spin phase, year and orientation that is said by itself
 BINS = 4  #: ranges of degrees of a profile in l, equal in log l
 ACTED_ON = ("sky and dipole", "sky", "dipole")  #: what a wave multiplies, if it is not added
+PERIODIC = ("", ACTED_ON[0])  #: what a wave multiplies whose period is not known
 ELSEWHERE = 32  #: highest degree of a signal from elsewhere: a lobe has as many orders, and what is finer averages out
 
 Key = tuple[str | int, ...]
@@ -164,8 +165,8 @@ class Scene:
     def peaks(self, filtered: FilteredMaps) -> dict[tuple[int, str], Peak]:
         """Return the largest peak in the residuals of every channel, by it and by what the wave acts on."""
         residual, whole = filtered.residual, filtered.expected + self.dipole
-        products = {"": residual, ACTED_ON[0]: residual * whole}
-        each = ((c, on) for c in range(len(self.time_lines)) for on in products)
+        products = dict(zip(PERIODIC, (residual, residual * whole), strict=True))
+        each = ((c, on) for c in range(len(self.time_lines)) for on in PERIODIC)
         return {(c, on): self.time_lines[c].peak(on, [products[on][i] for i in self.of(c)]) for c, on in each}
 
     def values(self, filtered: FilteredMaps) -> Vector:

@@ -24,13 +24,13 @@ from mcsim.reconstruction.forms import AddedToSamples
 from mcsim.reconstruction.grammar import structures
 from mcsim.reconstruction.periods import SHORTEST_S, SPANS, TimeLine
 from mcsim.reconstruction.scores import (
-    ACTED_ON,
     ELONGATION,
     HARMONICS,
     MONTH,
     MOVED,
     MOVING,
     ORDERS,
+    PERIODIC,
     Scene,
     View,
     coarse,
@@ -69,7 +69,7 @@ VISITS = 2_000_000  #: of a map, about, by which it is known when each pixel is 
 
 CODE = (
     *("config", "sphere", "instrument", "systematics", "simulation"),
-    *(f"reconstruction.{name}" for name in ("forms", "periods", "scores")),
+    *(f"reconstruction.{name}" for name in ("forms", "periods", "scores", "simulated_scores")),
     *(f"datavector.{name}" for name in ("analysis", "matched_filters", "wiener_filter")),
 )
 """What scores of simulations are computed with."""
@@ -140,7 +140,7 @@ def _time_line(model: Model, channel: int) -> TimeLine:
     period = pointing.model.period_of_samples(pointing.line)
     span_s = max(SHORTEST_S / SPANS, period)
     shape = int(np.ceil(pointing.model.duration_days * SECONDS_PER_DAY / span_s)), 12 * model.nside**2
-    visits, weights = [], dict[str, list[Map]]({"": [], ACTED_ON[0]: []})
+    visits, weights = [], dict[str, list[Map]]({on: [] for on in PERIODIC})
     sky = sky_variance(model.cl * model.sky_power, model.response[channel])
     dipole = np.asarray(site.dipole_uk) @ np.stack(healpy.pix2vec(model.nside, np.arange(shape[1])))
     for split, i in enumerate(members):
@@ -150,8 +150,8 @@ def _time_line(model: Model, channel: int) -> TimeLine:
             spans = np.minimum((chunk.time_s / span_s).astype(int), shape[0] - 1)
             total += csr_matrix((np.ones(len(spans)), (spans, chunk.pixel)), shape)
         visits.append(total @ diags(divided(1.0, total.sum(axis=0).A1)))
-        weights[""].append(model.parts[i].precision)
-        weights[ACTED_ON[0]].append(model.parts[i].precision * (dipole**2 + sky))
+        for on, square in zip(PERIODIC, (1.0, dipole**2 + sky), strict=True):
+            weights[on].append(model.parts[i].precision * square)
     return TimeLine.of(tuple(visits), span_s, weights)
 
 
@@ -230,19 +230,15 @@ def scores_of_maps(model: Model, scene: Scene, maps: Sequence[Map]) -> Vector:
 def scores(job: Job) -> Matrix:
     """Return the scores of the simulations of a job, shape (count, P): the task that a worker runs.
 
-    Behind them stand the evidences of peaks, if the job names no periods.
+    Behind them stand the falls of chi^2 of peaks, if the job names no periods.
     """
     model, scene = analysis_for(job).model, scene_for(job)
     filtered = (wiener_filter(model, maps) for maps in simulated_maps(job))
-    return np.stack([np.append(scene.values(one), [] if job.periods_s else peaks(scene, one)[0]) for one in filtered])
+    return np.stack([np.append(scene.values(one), [] if job.periods_s else _falls(scene, one)) for one in filtered])
 
 
-def peaks(scene: Scene, filtered: FilteredMaps) -> tuple[Vector, Vector]:
-    """Return the evidences of the largest peaks, all frequencies charged, and their periods, seconds."""
-    found = scene.peaks(filtered)
-    charged = np.log([scene.time_lines[channel].tried for channel, _ in found])
-    falls, periods = (np.array([getattr(one, key) for one in found.values()]) for key in ("fall", "period_s"))
-    return evidence(falls, 2) - charged, periods
+def _falls(scene: Scene, filtered: FilteredMaps) -> list[float]:
+    return [one.fall for one in scene.peaks(filtered).values()]
 
 
 def scene_for(job: Job) -> Scene:
@@ -259,7 +255,12 @@ def _scene(fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings,
 def search_of(analysis: Analysis, scene: Scene, ask: Ask) -> Search:
     """Return the search of the maps of a model."""
     null, count = null_scores(analysis, ask), len(scene.keys)
-    return Search(structures(scene), null[:, :count], null[:, count:])
+    return Search(structures(scene), null[:, :count], _charged(scene, null[:, count:]))
+
+
+def _charged(scene: Scene, falls: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the evidences of peaks from their falls of chi^2, shape (..., peaks), all frequencies charged."""
+    return evidence(falls, 2) - np.log([line.tried for line in scene.time_lines for _ in PERIODIC])
 
 
 def with_peaks(analysis: Analysis, scene: Scene, search: Search, maps: Sequence[Map], ask: Ask) -> tuple[Scene, Search]:
@@ -267,12 +268,13 @@ def with_peaks(analysis: Analysis, scene: Scene, search: Search, maps: Sequence[
 
     Periods are the same if they are so over the survey within half a cycle.
     """
-    evidences, periods = peaks(scene, wiener_filter(analysis.model, maps))
+    found = list(scene.peaks(wiener_filter(analysis.model, maps)).values())
+    evidences, periods = _charged(scene, np.array([one.fall for one in found])), [one.period_s for one in found]
     chosen = list[float]()
     for k in np.argsort(-evidences):
         apart = [abs(1.0 / periods[k] - 1.0 / one) * scene.time_lines[0].duration_s for one in chosen]
         if search.pvalue(evidences[k]) <= LEVEL and min(apart, default=np.inf) > 0.5:
-            chosen.append(float(periods[k]))
+            chosen.append(periods[k])
     if not chosen:
         return scene, search
     more = with_periods(analysis.model, scene, chosen)
