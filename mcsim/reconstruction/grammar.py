@@ -119,9 +119,8 @@ class Structure:
         return self.frame == "sky" and bool(self.acts_on) and self.size <= FREE
 
     def elsewhere(self, other: "Structure") -> bool:
-        """Return True if another is the same in another channel or split."""
-        mine, theirs = ((*one.says[:4], one.index) for one in (self, other))
-        return mine == theirs and (self.channel == other.channel) != (self.split == other.split)
+        """Return True if another is the same in another channel or split, or in all channels by their frequency."""
+        return self.says[:4] == other.says[:4] and (self.channel == other.channel) != (self.split == other.split)
 
     def of(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the scores of the structure, shape (..., size), from all, shape (..., P)."""
