@@ -183,7 +183,9 @@ def describe(
     lines = [head, *priors, *cost.lines(analysis, planned)]
     if source is None:
         more = simulated_scores.SIMULATIONS
-        lines.append(f"if the verdict is unknown: {more} simulations more, once for the model")
+        lines.append(
+            f"if the verdict is unknown: {more} simulations more, once for the model and where a period is found"
+        )
     if count:
         lines += controls.describe(analysis, count, run.compute.workers)
     return "\n".join(lines)

@@ -11,16 +11,17 @@ from mcsim import config
 from mcsim.datavector.analysis import simulated_maps
 from mcsim.datavector.campaign import Ask, constrained_jobs
 from mcsim.datavector.halves import Halves
+from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.words import refuted
 from mcsim.reconstruction import words
-from mcsim.reconstruction.grammar import ALIKE, Structure, structures
+from mcsim.reconstruction.grammar import ALIKE, Structure
 from mcsim.reconstruction.plugin import Plugin, plugin
 from mcsim.reconstruction.result import NSIDE, WORDS, Reconstructed
 from mcsim.reconstruction.scores import Scene
 from mcsim.reconstruction.search import Search
-from mcsim.reconstruction.simulated_scores import null_scores, scene_for, scores_of_maps
+from mcsim.reconstruction.simulated_scores import scene_for, scores_of_maps, search_of, with_peaks
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Map, Matrix, Vector
@@ -36,8 +37,7 @@ def reconstructed(result: DiagnosisResult, data: ObservedMaps, ask: Ask) -> Diag
     """Return the result with what is missing in the words of the grammar; ``ask`` simulates with :func:`scores`."""
     analysis = data.context.analysis
     scene = scene_for(analysis.job(analysis.run))
-    search = Search(structures(scene), null_scores(analysis, ask))
-    found, reduction = structures_of(data, scene, search)
+    found, reduction = structures_of(data, scene, search_of(analysis, scene, ask), ask)
     if reduction is not None and reduction.refutes(analysis.settings.reduction_sigma):
         what = " and ".join(one.says for one in found)
         note = f"What {what} fits best, and is not what is missing: {refuted(reduction)}."
@@ -45,9 +45,12 @@ def reconstructed(result: DiagnosisResult, data: ObservedMaps, ask: Ask) -> Diag
     return replace(result, unlisted=found, unlisted_held_out=reduction)
 
 
-def structures_of(data: ObservedMaps, scene: Scene, search: Search) -> tuple[tuple[Reconstructed, ...], HeldOut | None]:
+def structures_of(
+    data: ObservedMaps, scene: Scene, search: Search, ask: Ask
+) -> tuple[tuple[Reconstructed, ...], HeldOut | None]:
     """Return the structures that are found in maps, and how far they reduce the excess on held-out data."""
     analysis = data.context.analysis
+    scene, search = with_peaks(analysis, scene, search, data.data, ask)
     x = scores_of_maps(analysis.model, scene, data.data)
     made = Reconstruction(data, scene, search, x)
     found = search.run(x, made)
@@ -169,11 +172,25 @@ class Reconstruction:
                 shape, share = replace(structure, split=ALIKE), np.zeros(len(self.scene.views))
                 share[list(structure.views)] = structure.weights
             effects = [plugin("unlisted", shape, one, self.scene) for one in each]
-            if None not in effects:
+            if structure.moving:
+                found[row] = self._moved(structure, theta)[None]
+            elif None not in effects:
                 rows = [self.simulated([one], share).scores for one in effects if one is not None]
                 found[row] = np.stack(rows) - self.before.scores
             self._trial[k] = each, found[row]
         return found
+
+    def _moved(self, structure: Structure, theta: Vector) -> Vector:
+        """Return what a beam that follows a wave makes of all scores, on skies that the data constrain."""
+        analysis, share = self.data.context.analysis, np.zeros((len(self.scene.views), 1))
+        share[list(structure.views), 0] = structure.weights
+        plain = constrained_jobs(analysis, [], self.data.same_skies.observed, range(SKIES))[0]
+        found = []
+        for maps in simulated_maps(plain):
+            sky = wiener_filter(analysis.model, maps).sky
+            added = share * self.scene.moved(structure.moving, structure.order, theta, sky)
+            found.append(scores_of_maps(analysis.model, self.scene, list(np.add(maps, added))))
+        return np.asarray(np.mean(found, axis=0) - self.before.scores)
 
     def keep(self, member: int, amplitudes: Vector) -> None:
         """Keep the coordinates that these amplitudes of the responses mean, and what they make of the scores."""

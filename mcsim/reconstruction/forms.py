@@ -20,7 +20,6 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
-from mcsim.sphere.rotation import rotation_matrix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.systematics.base import Alm, Draw, Effect, Map, Site
 from mcsim.systematics.parametrization import Parametrization, Vector
@@ -175,10 +174,12 @@ class BeamOrder(Form):
 class InTime(Form):
     """Derive forms that depend on time from this class."""
 
-    #: "": constant; "spin", "year", "orientation": ``harmonic`` times spin phase, year or psi; "trend": from -1 to 1
-    #: through the survey; of what is added also "sky": a pattern, and those of :meth:`AddedToSamples.components`
+    #: "": constant; "spin", "year", "orientation": ``harmonic`` times spin phase, year or psi; "period": ``period_s``
+    #: from the start of the survey on; "trend": from -1 to 1 through the survey; of what is added also "sky": a
+    #: pattern, and those of :meth:`AddedToSamples.components`
     wave: ClassVar[str] = ""
     harmonic: ClassVar[int] = 1
+    period_s: ClassVar[float]
     #: of cosine and sine, of this and of each further harmonic, or of the pattern, or of components, or the constant
     coefficients: ClassVar[tuple[float, ...]]
     splits: ClassVar[tuple[float, ...]] = (1.0,)  #: factor in each of as many equal parts of the survey's time
@@ -202,6 +203,8 @@ class InTime(Form):
             phase = spin_phase(pointing, time_s)
         elif self.wave == "year":
             phase = 2.0 * np.pi * time_s / pointing.model.orbit_period_s
+        elif self.wave == "period":
+            phase = 2.0 * np.pi * time_s / self.period_s
         else:
             phase = orientation(pointing, time_s, site.frame) if psi is None else psi
         found = np.zeros(len(time_s))
@@ -213,33 +216,35 @@ class InTime(Form):
 
 @dataclass(frozen=True, kw_only=True)
 class AddedToSamples(InTime):
-    """Samples have a signal added, uK, whatever the sky: a wave, a pattern in some splits, or a dipole that turns."""
+    """Samples have a signal added, uK, whatever the sky: a wave, a pattern in some splits, or a dipole that turns.
+
+    A pattern is the sum of Q cos s psi + U sin s psi over ``spins``: of spin 0 real coefficients of a map, of others
+    those of E and then of B, from degree s on, all up to the same degree.
+    """
+
+    spins: ClassVar[tuple[int, ...]] = (0,)
 
     def components(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> list[Vector]:
         """Return what the coefficients of a wave multiply that is a dipole, shape (n,) each.
 
         "Sun": the line of sight along the Earth's motion, and towards the Sun; "lobe": the dipole along the beam's x
-        and y and the line of sight, uK; "Galaxy": a constant, and the quadrupole about the galactic pole along
-        these.
+        and y and the line of sight, uK.
         """
         outward, south, east = axes(theta, phi)
         pointing = site.pointed(self.name)
         if self.wave == "Sun":
             towards = (heading(pointing.model, time_s, site.frame, phase) for phase in (0.0, 0.5 * np.pi))
             return [np.sum(one * outward, axis=0) for one in towards]
-        if self.wave == "Galaxy":
-            pole = rotation_matrix(site.frame, "galactic")[2]
-            z, a, b = (pole @ one for one in (outward, south, east))
-            x, y = np.cos(psi) * a + np.sin(psi) * b, np.cos(psi) * b - np.sin(psi) * a
-            return [np.ones_like(z), x**2 - y**2, 2.0 * x * y, x * z, y * z, z**2 - 1.0 / 3.0]
         c, s, (a, b) = np.cos(psi), np.sin(psi), (site.dipole_uk @ south, site.dipole_uk @ east)
         return [c * a + s * b, c * b - s * a, site.dipole_uk @ outward]
 
     def signal(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> Vector:
         if self.wave == "sky":
             self.check_frame(site)
-            value = _map_of(self.coefficients)[healpy.ang2pix(_NSIDE, theta, phi)]
-        elif self.wave in ("Sun", "lobe", "Galaxy"):
+            pixel, value = healpy.ang2pix(_NSIDE, theta, phi), np.zeros(len(theta))
+            for s, (q, u) in zip(self.spins, _maps_of(self.coefficients, self.spins), strict=True):
+                value += np.cos(s * psi) * q[pixel] + np.sin(s * psi) * u[pixel]
+        elif self.wave in ("Sun", "lobe"):
             value = np.array(self.coefficients) @ np.array(self.components(time_s, theta, phi, psi, site))
         else:
             value = self.over_time(time_s, psi, site)
@@ -376,9 +381,18 @@ def raised(alm: Alm, lmax: int, power: int) -> Alm:
 
 
 @lru_cache(maxsize=4)
-def _map_of(coefficients: tuple[float, ...]) -> Map:
-    top = int(np.sqrt(len(coefficients))) - 1
-    return np.asarray(healpix.synthesis(real.to_alm(np.array(coefficients), top)[None], _NSIDE, top)[0])
+def _maps_of(coefficients: tuple[float, ...], spins: tuple[int, ...]) -> list[NDArray[np.float64]]:
+    """Return Q and U of patterns of every spin, shape (2, npix) each; of spin 0 the map, and zero."""
+    fields = sum(2 if s else 1 for s in spins)
+    top = round(np.sqrt((len(coefficients) + sum(2 * s**2 for s in spins)) / fields)) - 1
+    rest, found = np.array(coefficients), []
+    for s in spins:
+        count = (top + 1) ** 2 - s**2
+        each, rest = np.split(rest, [2 * count if s else count])
+        alms = np.stack([real.to_alm(np.append(np.zeros(s**2), one), top) for one in each.reshape(-1, count)])
+        made = healpix.synthesis(alms, _NSIDE, top, spin=s)
+        found.append(made if s else np.stack([made[0], np.zeros_like(made[0])]))
+    return found
 
 
 FORMS: dict[str, type[Form]] = {

@@ -10,7 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import poch
+from scipy.linalg import block_diag
+from scipy.special import ive, poch
 
 from mcsim.reconstruction.forms import REFERENCE_GHZ
 from mcsim.reconstruction.scores import (
@@ -21,6 +22,7 @@ from mcsim.reconstruction.scores import (
     MODULATION,
     MONTH,
     ORDERS,
+    TURNED,
     Key,
     Scene,
     View,
@@ -32,6 +34,11 @@ from mcsim.support.arrays import Matrix, Vector
 ALIKE, OPPOSITE = "alike", "opposite"
 
 FREE = 5  #: coordinates of a pattern on the sky whose responses are simulated one by one, at most
+
+LOBE = 2  #: highest degree and spin of what a lobe sees
+
+CROSSINGS, NARROW = 24, (2.0, 8.0)
+"""Of the Sun in a lobe: how many spin phases of it are tried, and which concentrations of a von Mises function."""
 
 ANY = f"1-{HARMONICS}"  #: of a wave in any way: a constant and all harmonics
 
@@ -62,6 +69,7 @@ class Structure:
     #: matrix from these sums to the coordinates, shape (coordinates, K); None: they are the coordinates
     mix: Matrix | None = field(default=None, repr=False)
     views: tuple[int, ...] = field(default=(), repr=False)  #: indices of the maps
+    tried: float = 1.0  #: number of such structures among which the data have chosen it
 
     @property
     def size(self) -> int:
@@ -90,14 +98,29 @@ class Structure:
         return other.stage in stage and other.kind == mean and alike
 
     @property
+    def choice(self) -> tuple[str | None, ...]:
+        """Return what is the same of structures among which the data choose; nothing for others."""
+        return (*self.says[:3], *self.says[4:6]) if self.tried > 1.0 else ()
+
+    @property
+    def order(self) -> int:
+        """Return the order of a change of the beam."""
+        return int(self.kind.split()[1])
+
+    @property
+    def moving(self) -> str:
+        """Return the wave that a beam follows, or nothing."""
+        rest = self.kind.split(maxsplit=2)[2:] if self.stage == "beam" else []
+        return rest[0] if rest and rest[0].startswith(("spin", "year")) else ""
+
+    @property
     def by_coordinate(self) -> bool:
         """Return True for a pattern of few coordinates that multiplies the sky: each has a response of its own."""
         return self.frame == "sky" and bool(self.acts_on) and self.size <= FREE
 
     def elsewhere(self, other: "Structure") -> bool:
-        """Return True if another is the same in another channel or split."""
-        mine, theirs = ((*one.says[:4], one.index) for one in (self, other))
-        return mine == theirs and (self.channel == other.channel) != (self.split == other.split)
+        """Return True if another is the same in another channel or split, or in all channels by their frequency."""
+        return self.says[:4] == other.says[:4] and (self.channel == other.channel) != (self.split == other.split)
 
     def of(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the scores of the structure, shape (..., size), from all, shape (..., P)."""
@@ -108,12 +131,30 @@ class Structure:
         """Return the same, measured in the maps of one split; ``splits`` are those of all maps."""
         kept = [k for k, view in enumerate(self.views) if splits[view] == split]
         return Structure(
-            *self.says, self.rows[:, kept], self.weights[kept], self.mix, tuple(self.views[k] for k in kept)
+            *self.says, self.rows[:, kept], self.weights[kept], self.mix, tuple(self.views[k] for k in kept), self.tried
         )
 
 
 def _briefly(kind: str) -> list[str]:
-    return kind.split()[: 1 if kind.startswith("degrees") else 2]
+    return kind.split()[: 1 if kind.startswith(("degrees", "crossing")) else 2]
+
+
+def _crossing(phase: float, narrow: float) -> Matrix:
+    """Return a constant, and cosines and sines of the spin phase, of exp(narrow cos(phase of the spin - phase)).
+
+    A lobe whose response is exponential in the cosine of the distance from its axis sees the Sun so, whose distance
+    from the spin axis is fixed: a von Mises function, of modified Bessel functions.
+    """
+    k = np.arange(1, ELONGATION + 1)
+    waves = ive(k, narrow)[:, None] * np.stack([np.cos(k * phase), np.sin(k * phase)], axis=1)
+    return np.append(ive(0, narrow) * np.sqrt(4.0 * np.pi), 2.0 * waves)[None]
+
+
+_CROSSINGS = {
+    f"crossing {360 * n // CROSSINGS} {narrow:g}": _crossing(2.0 * np.pi * n / CROSSINGS, narrow)
+    for narrow in NARROW
+    for n in range(CROSSINGS)
+}
 
 
 def structures(scene: Scene) -> tuple[Structure, ...]:
@@ -153,16 +194,29 @@ def _of_maps(scene: Scene) -> Iterator[Structure]:
             kept = [i for i in views if factors[scene.views[i].split] != 0.0]
             weights = np.array([factors[scene.views[i].split] for i in kept])
             for stage, acts_on, frame, kind, keys, mix in _forms(scene, split, kept):
-                if name is None and (frame == "sky" or stage in ("square", "cube")):
+                if name is None and (_fixed(frame, kind) or stage in ("square", "cube")):
                     if stage != "added" or kind not in ALSO_COMMON:
                         continue  # what all channels see alike is the sky itself, which the model knows as random
                     stage, frame = ("power", "") if split == ALIKE else (stage, frame)
                 rows = _rows(scene, keys, kept)
-                yield Structure(stage, acts_on, frame, kind, name, split, None, rows, weights, mix, tuple(kept))
+                own = name, split, None, rows, weights, mix, tuple(kept), _tried(scene, kind)
+                yield Structure(stage, acts_on, frame, kind, *own)
         yield from _high_orders(scene, name, views)
     yield from _modulations(scene)
     if len({f for f in scene.frequencies if f is not None}) > 1 and None not in scene.frequencies:
         yield from _scaled(scene)
+
+
+def _tried(scene: Scene, kind: str) -> float:
+    """Return the number of structures of a kind, or of frequencies, among which the data choose."""
+    if kind.startswith("period"):
+        return scene.time_lines[0].tried
+    return float(len(_CROSSINGS)) if kind.startswith("crossing") else 1.0
+
+
+def _fixed(frame: str, kind: str) -> bool:
+    """Return True for a pattern fixed to the sky that does not turn with the beam."""
+    return frame == "sky" and not kind.startswith("orientation")
 
 
 def _splits(splits: Sequence[str]) -> Iterator[tuple[str, tuple[float, ...]]]:
@@ -181,10 +235,9 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
     """Yield stage, what it acts on, frame, kind, keys without the map, and mix."""
     view = scene.views[kept[0]]
     yield from _added(scene)
+    yield from _turned(scene, view)
     lobe: list[Key] = [("lobe", 0), ("lobe", 1), ("dipole",)]
     yield "added", "dipole", "spacecraft", "lobe", lobe, None
-    if len(view.w) > 1:
-        yield "added", "", "spacecraft", "Galaxy", [("added", 0), *(("Galaxy", k) for k in range(5))], None
     for name in view.elsewhere:
         if all(name in scene.views[i].elsewhere for i in kept):
             for on in ACTED_ON[:2]:
@@ -201,6 +254,8 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
     for s in range(min(scene.split_orders, len(view.w)) + 1):
         for kind, mix in _profiles(scene, s):
             yield "beam", "sky", "scan", kind, _beam(scene, s), mix
+    for wave, s in view.moves:
+        yield "beam", "sky", "scan", f"order {s} {wave}", [("moving", wave, s, c) for c in range(4 if s else 2)], None
     if split != ALIKE:
         return
     top = min(GAIN, scene.lmax)
@@ -217,6 +272,9 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
     yield "square", "sky", "", "square", [("square of the sky",)], None
     yield "cube", "sky and dipole", "", "cube", [("cube",)], None
     yield "rotation", "sky and dipole", "sky", "rotation", [("rotation", axis) for axis in range(3)], None
+    spin: list[Key] = [("", f"spin {k}", c) for k in range(1, ELONGATION + 1) for c in (0, 1)]
+    for kind, mix in _CROSSINGS.items() if scene.timed else ():
+        yield "added", "", "Sun", kind, [("added", 0), *spin], mix
 
 
 def _timed(scene: Scene, view: View, on: str) -> Iterator[_Form]:
@@ -229,7 +287,7 @@ def _timed(scene: Scene, view: View, on: str) -> Iterator[_Form]:
     waves: dict[str, list[Key]] = {name: [(on, name, c) for c in range(len(own))] for name, own in view.waves.items()}
     for name, keys in waves.items():
         wave, _, harmonic = name.partition(" ")
-        if wave != "Sun" and int(harmonic or 1) <= HARMONICS:
+        if wave == "period" or (wave != "Sun" and int(harmonic or 1) <= HARMONICS):
             yield stage, on, "spacecraft" if wave == "orientation" else "time", name, keys, None
     if not scene.timed or on in ACTED_ON[1:]:
         return
@@ -247,8 +305,8 @@ def _timed(scene: Scene, view: View, on: str) -> Iterator[_Form]:
 
 def _added(scene: Scene) -> Iterator[_Form]:
     """Yield patterns on the sky that are added: of few degrees, and zonal ones."""
-    yield "added", "", "sky", "monopole", [("added", 0)], None
-    yield "added", "", "sky", "dipole", [("added", j) for j in (1, 2, 3)], None
+    for degree, kind in enumerate(("monopole", "dipole", "quadrupole")):
+        yield "added", "", "sky", kind, [("added", j) for j in range(degree**2, (degree + 1) ** 2)], None
     for degree in sorted({min(top, scene.degree) for top in (1, 2, 4, scene.degree)}):
         yield "added", "", "sky", f"degrees 0-{degree}", [("added", j) for j in range((degree + 1) ** 2)], None
     keys: list[Key] = [("added", j) for j in range((scene.degree + 1) ** 2)]
@@ -256,10 +314,34 @@ def _added(scene: Scene) -> Iterator[_Form]:
         yield "added", "", "sky", kind, keys, zonal
 
 
+def _turned(scene: Scene, view: View) -> Iterator[_Form]:
+    """Yield patterns of few degrees that turn with the beam: of one spin, and those of all as a lobe makes them."""
+    for s in view.spins:
+        for top, degrees in ((s, f"degree {s}"), (TURNED[s], f"degrees {s}-{TURNED[s]}")):
+            yield "added", "", "sky", f"orientation {s} {degrees}", _turning(s, top), None
+    if len(view.spins) == LOBE:
+        every: list[Key] = [("added", j) for j in range((LOBE + 1) ** 2)]
+        every += [key for s in view.spins for key in _turning(s, LOBE)]
+        yield "added", "", "spacecraft", f"degrees 0-{LOBE}", every, None
+        yield "added", "", "spacecraft", "Galaxy", every, _galaxy(scene.frame)
+
+
+def _turning(s: int, top: int) -> list[Key]:
+    return [("turned", s, p, j) for p in (0, 1) for j in range(s**2, (top + 1) ** 2)]
+
+
+def _galaxy(frame: str) -> Matrix:
+    """Return a constant and the quadrupole about the galactic pole, of E and B of every spin up to LOBE."""
+    quadrupole = real.zonal(rotation_matrix(frame, "galactic")[2], LOBE)[LOBE]
+    fields = [quadrupole, *(quadrupole[s**2 :] for s in range(1, LOBE + 1) for _ in (0, 1))]
+    return np.vstack([np.eye(1, sum(map(len, fields))), block_diag(*fields)])
+
+
 def _latitudes(frame: str, top: int) -> list[tuple[str, Matrix]]:
     """Return the real coefficients of patterns of one latitude alone, by what they are called."""
     poles = {name: rotation_matrix(frame, name)[2] for name in ("ecliptic", "galactic")}
-    return [(f"latitude {name}", real.zonal(pole, top)) for name, pole in poles.items()]
+    zonal = {f"latitude {name}": real.zonal(pole, top) for name, pole in poles.items()}
+    return [*((f"{name} 0-2", each[:3]) for name, each in zonal.items() if top > 2), *zonal.items()]
 
 
 def _beam(scene: Scene, s: int) -> list[Key]:

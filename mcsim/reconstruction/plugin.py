@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mcsim.reconstruction.forms import FORMS, Form
-from mcsim.reconstruction.grammar import ALIKE, ANY, OPPOSITE, Structure
+from mcsim.reconstruction.grammar import ALIKE, ANY, LOBE, OPPOSITE, Structure
 from mcsim.reconstruction.scores import ELSEWHERE, MONTH, Scene
 from mcsim.support.arrays import Vector
 
@@ -77,8 +77,8 @@ def _literal(value: Any) -> str:
 def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plugin | None:
     """Return the effect of a structure with fitted coordinates; None if no effect of the simulator can be like it.
 
-    These are powers of unknown patterns, beams, signals from elsewhere and noise that differ between splits, and what
-    depends on time or orientation where the pointing is not known.
+    These are powers of unknown patterns, beams that follow a wave, beams, signals from elsewhere and noise that differ
+    between splits, and what depends on time or orientation where the pointing is not known.
     """
     made = _form(structure, theta, scene)
     if made is None:
@@ -105,6 +105,8 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
     if structure.frame in ("spacecraft", "time", "Sun"):
         timed |= _wave(structure)
     match structure.stage, structure.frame:
+        case "added", "sky" if structure.kind.startswith("orientation"):
+            return "AddedToSamples", {"wave": "sky", "spins": (int(structure.kind.split()[1]),), **timed}
         case "added", "sky" if structure.kind != "power":
             if alike:
                 return "AddedPattern", {"coefficients": pattern, "index": structure.index or 0.0}
@@ -126,8 +128,8 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             one = (float(theta[0]) * CONSTANT,) if structure.acts_on == "dipole" else pattern
             acting = {"on_sky": "sky" in structure.acts_on, "on_dipole": "dipole" in structure.acts_on}
             return "GainPattern", {"coefficients": one, **acting}
-        case "beam", _ if alike:
-            order = int(structure.kind.split()[1])
+        case "beam", _ if alike and not structure.moving:
+            order = structure.order
             values = tuple(map(complex, np.reshape(pattern, (-1, 2)) @ [1.0, 1j])) if order else pattern
             edges = scene.edges(max(order, 1))
             return "BeamOrder", {"order": order, "edges": edges, "top": scene.lmax, "values": values}
@@ -158,23 +160,24 @@ def _wave(structure: Structure) -> dict[str, Any]:
         return {"wave": "Sun"} if wave == "dipole" else {"wave": "spin", "harmonic": 0}
     if structure.stage == "added" and structure.acts_on == "dipole":
         return {"wave": "lobe"}
+    if wave in ("Galaxy", "degrees"):
+        return {"wave": "sky", "spins": tuple(range(LOBE + 1))}
     if wave == "month":
         return {"wave": "year", "harmonic": MONTH[0]}
+    if wave == "period":
+        return {"wave": wave, "period_s": float(rest)}
     return {"wave": wave, "harmonic": int(rest)} if rest.isdigit() else {"wave": wave, "harmonic": 0}
 
 
 def _numbers(structure: Structure, theta: Vector) -> tuple[float, ...]:
     """Return the real coefficients of a pattern."""
-    if structure.kind == "elongation" or structure.kind.endswith(ANY):  # from the constant on, which has no sine
-        cosines = np.stack([theta, np.zeros_like(theta)], axis=1).ravel()
-        waves = cosines if structure.kind == "elongation" else np.insert(theta, 1, 0.0)
-        return (float(waves[0]) / CONSTANT, *map(float, waves[1:]))
-    if structure.kind == "Galaxy":
-        return float(theta[0]) / CONSTANT, *map(float, theta[1:])
     found = theta if structure.mix is None else structure.mix.T @ theta
-    return tuple(
-        map(float, np.append(0.0, found) if structure.frame != "Sun" and structure.kind == "dipole" else found)
-    )
+    if structure.kind == "elongation":  # of cosines alone
+        found = np.delete(np.stack([found, np.zeros_like(found)], axis=1).ravel(), 1)
+    if structure.kind.startswith(("elongation", "crossing")) or structure.kind.endswith(ANY):  # a constant has no sine
+        return float(found[0]) / CONSTANT, 0.0, *map(float, found[1:])
+    lower = {"dipole": 1, "quadrupole": 4}.get(structure.kind, 0) if structure.frame != "Sun" else 0
+    return tuple(map(float, np.append(np.zeros(lower), found)))
 
 
 def _factors(split: str, splits: Sequence[str]) -> tuple[float, ...]:

@@ -14,12 +14,13 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
+from scipy.special import poch
 
 from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.reconstruction.forms import boosts, rotations
+from mcsim.reconstruction.periods import Peak, TimeLine
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
-from mcsim.sphere.rotation import rotation_matrix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Alm, Cl, Map, Matrix, Vector, divided
 from mcsim.systematics.spacecraft import axes
@@ -27,11 +28,15 @@ from mcsim.systematics.spacecraft import axes
 ADDED, GAIN = 8, 4  #: highest degree of patterns that are added, and of those that multiply
 ORDERS = 4  #: highest order of a beam, and of what follows its orientation
 MODULATION = 2  #: highest degree of patterns that multiply the sky itself
+TURNED = {1: 3, 2: 4}  #: highest degree of patterns on the sky that turn with the beam, by their spin
+MOVING = ("year 1", "spin 1", "spin 2")  #: waves that a beam follows
+MOVED = 2  #: highest order of a beam that follows a wave
 ELONGATION = 6  #: highest harmonic of the spin phase in what depends on the distance from the Sun
 MONTH = (12, 14)  #: harmonics of the year that a month is made of, from 26 to 30 days
 HARMONICS = 4  #: highest harmonic of spin phase, year and orientation that is said by itself
 BINS = 4  #: ranges of degrees of a profile in l, equal in log l
 ACTED_ON = ("sky and dipole", "sky", "dipole")  #: what a wave multiplies, if it is not added
+PERIODIC = ("", ACTED_ON[0])  #: what a wave multiplies whose period is not known
 ELSEWHERE = 32  #: highest degree of a signal from elsewhere: a lobe has as many orders, and what is finer averages out
 
 Key = tuple[str | int, ...]
@@ -47,11 +52,23 @@ class View:
     w: NDArray[np.complex128]  #: orientation moments, shape (smax, npix)
     #: means over the samples of every pixel of what follows time or orientation: cosine and sine, and so on, by name
     waves: Mapping[str, tuple[Map, ...]]
+    #: means of cos and sin of a wave times exp(-i s psi), shape (2, npix), by the wave and s from 1 on
+    moving: Mapping[tuple[str, int], NDArray[np.complex128]]
     #: means over the samples of every coarse pixel of what they see elsewhere, shape (pixels, pixels), by name
     elsewhere: Mapping[str, csr_matrix]
     precision: Map  #: one over the variance of the noise
     response: Cl  #: B_l w_l of the channel, shape (lmax + 1,)
     kernel: Cl  #: b_l0 of its beam, shape (lmax + 1,)
+
+    @property
+    def spins(self) -> tuple[int, ...]:
+        """Return the spins of patterns that turn with the beam, as far as its orientations are known."""
+        return tuple(s for s in TURNED if s <= len(self.w))
+
+    @property
+    def moves(self) -> tuple[tuple[str, int], ...]:
+        """Return the waves that a beam may follow, if times are known, each with its orders."""
+        return tuple((wave, s) for wave in MOVING if (wave, 1) in self.moving for s in range(MOVED + 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +92,7 @@ class Scene:
     #: directions elsewhere in the frame of each channel's beam (x, y, outward) with weights, shape (n, 4), by what
     #: is there, if it is known when and how every sample was pointed, and splits are spans of time; else none
     elsewhere: tuple[Mapping[str, Matrix], ...]
+    time_lines: tuple[TimeLine, ...]  #: of every channel, if the pointing of every sample is known; else none
 
     @property
     def timed(self) -> bool:
@@ -114,11 +132,13 @@ class Scene:
             for kind in ("gain of the sky", "gain"):
                 found += [(kind, i, j) for j in range((min(GAIN, self.lmax) + 1) ** 2)]
             found += [(kind, i) for kind in ("dipole", "square of the sky", "square", "cube")]
-            found += [("Galaxy", i, k) for k in range(5 if len(view.w) > 1 else 0)]
+            for s in view.spins:
+                found += [("turned", i, s, p, j) for p in (0, 1) for j in range(s**2, (TURNED[s] + 1) ** 2)]
             found += [("lobe", i, 0), ("lobe", i, 1), *(("rotation", i, axis) for axis in range(3))]
             every = [(name, c) for name, maps in view.waves.items() for c in range(len(maps))]
             found += [(on, i, name, c) for on in ("", *ACTED_ON) for name, c in every]
             found += [("elsewhere", i, name, on) for name in view.elsewhere for on in ACTED_ON[:2]]
+            found += [("moving", i, wave, s, c) for wave, s in view.moves for c in range(4 if s else 2)]
             found += [("noise", i, j) for j in range(9)]
             for s in range(min(ORDERS, len(view.w)) + 1):
                 if s <= self.split_orders or i == self.of(view.channel)[0]:
@@ -142,11 +162,19 @@ class Scene:
         n = healpy.pix2vec(self.nside, np.arange(12 * self.nside**2))
         return np.stack([real.field(unit, *n) for unit in np.eye((GAIN + 1) ** 2)])
 
+    def peaks(self, filtered: FilteredMaps) -> dict[tuple[int, str], Peak]:
+        """Return the largest peak in the residuals of every channel, by it and by what the wave acts on."""
+        residual, whole = filtered.residual, filtered.expected + self.dipole
+        products = dict(zip(PERIODIC, (residual, residual * whole), strict=True))
+        each = ((c, on) for c in range(len(self.time_lines)) for on in PERIODIC)
+        return {(c, on): self.time_lines[c].peak(on, [products[on][i] for i in self.of(c)]) for c, on in each}
+
     def values(self, filtered: FilteredMaps) -> Vector:
         """Return the scores, shape (len(keys),)."""
         found: list[NDArray[np.float64]] = []
         looked_at = filtered.sky + dipole_alm(self.dipole_uk, self.lmax)
         turned = rotations(looked_at, self.lmax)
+        bent = [self._derivatives(looked_at, self.views[self.of(c)[0]].response) for c in range(len(self.channels))]
         for i, view in enumerate(self.views):
             r, sky, adjoint = filtered.residual[i], filtered.expected[i], filtered.adjoint[i]
             whole = sky + self.dipole
@@ -154,7 +182,7 @@ class Scene:
             top = min(GAIN, self.lmax)
             found += [self._without_dipole(r, sky, adjoint, top), _low(r * whole, top)]
             found.append(np.array([r @ self.dipole, r @ sky**2, r @ whole**2, r @ whole**3]))
-            found += [self._galaxy(r, view), np.array(self._lobe(r, view))]
+            found += [*_turned(r, view), np.array(self._lobe(r, view))]
             through = (alm_.multiply(one, view.response, self.lmax) for one in turned)
             found.append(np.array([_product(adjoint, one, self.lmax) for one in through]))
             every = [one for maps in view.waves.values() for one in maps]
@@ -163,6 +191,7 @@ class Scene:
             found += [np.array([(r * sky - lost) @ one for one in every])]
             found += [np.array([(r * self.dipole) @ one for one in every])]
             found += self._elsewhere(r, filtered.sky, view)
+            found += [_moving(r, view, wave, bent[view.channel][s], s) for wave, s in view.moves]
             found.append(0.5 * self._patterns[:9] @ divided(r**2, view.precision))
             found += list(self._orders(view, filtered.orders[i], i))
         for channel in range(len(self.channels)):
@@ -176,19 +205,6 @@ class Scene:
         south, east = self._tangent
         c, s = view.w[0].real, -view.w[0].imag  # means of cos psi and sin psi
         return float(r @ (c * south + s * east)), float(r @ (c * east - s * south))
-
-    def _galaxy(self, r: Map, view: View) -> Vector:
-        """Return the scores of the quadrupole about the galactic pole, as a lobe that turns with the beam sees it."""
-        if len(view.w) < 2:
-            return np.zeros(0)
-        frame = axes(*healpy.pix2ang(self.nside, np.arange(12 * self.nside**2)))
-        pole = rotation_matrix(self.frame, "galactic")[2]
-        outward, south, east = (pole @ one for one in frame)
-        (c, c2), (s, s2) = view.w[:2].real, -view.w[:2].imag
-        plus, cross = south**2 - east**2, 2.0 * south * east
-        turned = [c2 * plus + s2 * cross, c2 * cross - s2 * plus]
-        turned += [outward * (c * south + s * east), outward * (c * east - s * south), outward**2 - 1.0 / 3.0]
-        return np.array(turned) @ r
 
     @cached_property
     def _tangent(self) -> tuple[Map, Map]:
@@ -232,6 +248,35 @@ class Scene:
                 found.append(np.array([total.real, total.imag] if s else [total.real]))
         return found
 
+    def moved(self, wave: str, s: int, theta: Vector, sky: Alm) -> NDArray[np.float64]:
+        """Return what a derivative of a sky adds to every map that follows a wave, uK, shape (maps, npix).
+
+        ``theta``: coordinates of the structure, of cosine and then of sine, for s > 0 along and across the beam's x.
+        """
+        added, pairs = np.zeros((len(self.views), 12 * self.nside**2)), np.reshape(theta, (2, -1))
+        looked_at = sky + dipole_alm(self.dipole_uk, self.lmax)
+        for c in range(len(self.channels)):
+            field = self._derivatives(looked_at, self.views[self.of(c)[0]].response)[s]
+            for i in self.of(c):
+                if s == 0:
+                    means = np.tensordot(pairs[:, 0], self.views[i].waves[wave], axes=1)
+                    added[i] = field[0] * means
+                else:
+                    turned = pairs @ [1.0, -1j] @ self.views[i].moving[wave, s]
+                    added[i] = field[0] * turned.real - field[1] * turned.imag
+        return added
+
+    def _derivatives(self, alm: Alm, response: Cl) -> list[NDArray[np.float64]]:
+        """Return derivatives of a sky through a beam: l (l + 1), and E of spins up to MOVED, shape (1 or 2, npix)."""
+        ell = np.arange(self.lmax + 1.0)
+        found = []
+        for s in range(MOVED + 1 if self.timed else 0):
+            shape = np.sqrt(poch(np.maximum(ell - s + 1.0, 0.0), 2 * s)) if s else ell * (ell + 1.0)
+            electric = alm_.multiply(alm, response * shape, self.lmax)[None]
+            both = np.concatenate([electric, np.zeros_like(electric)]) if s else electric
+            found.append(healpix.synthesis(both, self.nside, self.lmax, spin=s) / self.lmax ** (s or 2))
+        return found
+
     def _powers(self, a: Alm, b: Alm) -> Vector:
         """Return the power in ranges of degrees."""
         power = np.bincount(alm_.degrees(self.lmax), _twice(self.lmax) * (a * b.conj()).real, self.lmax + 1)
@@ -261,6 +306,23 @@ class Scene:
 def coarse(nside: int) -> int:
     """Return the nside of the pixels of what is seen elsewhere."""
     return min(nside, ELSEWHERE // 2)
+
+
+def _turned(r: Map, view: View) -> list[Vector]:
+    """Return the scores of Q cos s psi + U sin s psi, of E and then B of every spin s."""
+    found = []
+    for s in view.spins:
+        both = healpix.adjoint(r * np.stack([view.w[s - 1].real, -view.w[s - 1].imag]), TURNED[s], spin=s)
+        found += [real.coefficients(one, TURNED[s], TURNED[s])[s**2 :] for one in both]
+    return found
+
+
+def _moving(r: Map, view: View, wave: str, field: NDArray[np.float64], s: int) -> Vector:
+    """Return the scores of a derivative of the sky along and across the beam's x axis, times cosine and sine."""
+    if s == 0:
+        return np.array([(r * field[0]) @ one for one in view.waves[wave]])
+    q, u, w = r * field[0], r * field[1], view.moving[wave, s]
+    return np.array([f for one in w for f in (q @ one.real - u @ one.imag, u @ one.real + q @ one.imag)])
 
 
 def _low(product: Map, top: int) -> Vector:

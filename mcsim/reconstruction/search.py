@@ -6,7 +6,7 @@ from simulations; the tests are exact for their number (:mod:`mcsim.stats.gaussi
 """
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from typing import Protocol
@@ -72,6 +72,8 @@ class Search:
 
     grammar: tuple[Structure, ...]
     simulations: Matrix
+    #: evidences of structures that data choose from a continuum, in each simulation, shape (N, n)
+    peaks: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
 
     @cached_property
     def nulls(self) -> tuple[SimulatedGaussian | None, ...]:
@@ -103,7 +105,8 @@ class Search:
             a = np.sum(white**2, axis=1) / null.dof * count / (count - 1)
             square = (null.dof - 1) * a / np.maximum(1.0 - a, 1e-12)
             falls[row] = square * (null.dof - null.dimension - 2) / (null.dof - 1)
-        return np.asarray(self._evidences(falls, range(len(self.grammar))).max(axis=0))
+        found = self._evidences(falls, range(len(self.grammar))).max(axis=0)
+        return np.asarray(np.maximum(found, self.peaks.max(axis=1, initial=-np.inf)) if self.peaks.size else found)
 
     def pvalue(self, value: float) -> float:
         """Return the global p-value of an evidence: by rank, beyond the last TAIL of simulations exponential.
@@ -190,8 +193,9 @@ class Search:
         """Return structures to compare: the most evident one, and those that may be it on this sky.
 
         These are the best of every other stage, the same in other channels, splits or profiles, whose own scores do not
-        tell all that they do to the others, those near it, and the best of every frame.
-        All their scores together have as many elements as a fraction 1/SPARE of the simulations at most.
+        tell all that they do to the others, those near it, and the best of every frame. Of many among which the data
+        choose it is the best. All their scores together have as many elements as a fraction 1/SPARE of the simulations
+        at most.
         """
         order = [k for k in map(int, np.argsort(-values)) if values[k] > 0.0]
         each = [self.grammar[k] for k in order]
@@ -207,7 +211,7 @@ class Search:
         wanted += [k for k in order if values[order[0]] - values[k] < NEAR]
         wanted += _firsts(order, [(one.stage, one.acts_on, one.frame) for one in each])
         chosen, rows = list[int](), 0
-        for k in dict.fromkeys(wanted):
+        for k in _firsts(wanted, [self.grammar[k].choice or k for k in wanted]):
             if len(chosen) < FINALISTS and rows + self.grammar[k].size <= len(self.simulations) // SPARE:
                 chosen.append(k)
                 rows += self.grammar[k].size
@@ -272,7 +276,7 @@ def _rarity(structure: Structure) -> float:
     part = structure.stage in ("gain", "square", "elsewhere") and structure.acts_on != "sky and dipole"
     odd = part or structure.stage == "cube" or structure.kind.endswith("low l")
     rare = (structure.split != ALIKE) + odd + (structure.stage == "elsewhere")
-    return rare * float(np.log(RARE))
+    return rare * float(np.log(RARE)) + float(np.log(structure.tried))
 
 
 def evidence(fall: NDArray[np.float64], size: int) -> NDArray[np.float64]:

@@ -10,27 +10,43 @@ from typing import Any
 
 import healpy
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, diags
 
 from mcsim import config
 from mcsim.datavector.analysis import Analysis, Job, Kinds, analysis_for, simulated_maps
 from mcsim.datavector.campaign import Ask, seeded
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import Model, wiener_filter
-from mcsim.instrument.scan import MapGrid
+from mcsim.datavector.wiener_filter import FilteredMaps, Model, sky_variance, wiener_filter
+from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel
 from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.reconstruction.forms import AddedToSamples
-from mcsim.reconstruction.scores import ELONGATION, HARMONICS, MONTH, ORDERS, Scene, View, coarse
+from mcsim.reconstruction.grammar import structures
+from mcsim.reconstruction.periods import SHORTEST_S, SPANS, TimeLine
+from mcsim.reconstruction.scores import (
+    ELONGATION,
+    HARMONICS,
+    MONTH,
+    MOVED,
+    MOVING,
+    ORDERS,
+    PERIODIC,
+    Scene,
+    View,
+    coarse,
+)
+from mcsim.reconstruction.search import LEVEL, Search, evidence
 from mcsim.simulation.pixel_means import signal_of
 from mcsim.simulation.tod import samples
 from mcsim.support import folders
 from mcsim.support.arrays import Map, Matrix, Vector, divided
 from mcsim.support.code import package_digest
 from mcsim.systematics import Pointing
-from mcsim.systematics.spacecraft import axes
+from mcsim.systematics.spacecraft import axes, spin_phase
 
 SIMULATIONS = 400
-"""Of the model, for mean and covariance of the scores: as many realizations more, once for each model."""
+"""Of the model, for mean and covariance of the scores: as many realizations more, once for each model, and once for
+each period that is found."""
 
 SEED = 0x6D63 * 1_000 + 4  #: of these simulations; those of the data vector and of the controls have others
 
@@ -49,9 +65,11 @@ WAVES: dict[str, dict[str, Any]] = {
 TAIL_DEG = 15.0  #: of the spin, after which the tail of a slow response has fallen by e
 LAGS = {"-1/8": -0.125, "+1/8": 0.125, "-1/4": -0.25, "+1/4": 0.25, "1/2": 0.5}  #: turns of the spin after a sample
 SAMPLES = 200_000  #: of a map, about, by which directions elsewhere are known
+VISITS = 2_000_000  #: of a map, about, by which it is known when each pixel is observed
 
 CODE = (
-    *("config", "sphere", "instrument", "systematics", "simulation", "reconstruction.forms", "reconstruction.scores"),
+    *("config", "sphere", "instrument", "systematics", "simulation"),
+    *(f"reconstruction.{name}" for name in ("forms", "periods", "scores", "simulated_scores")),
     *(f"datavector.{name}" for name in ("analysis", "matched_filters", "wiener_filter")),
 )
 """What scores of simulations are computed with."""
@@ -70,10 +88,8 @@ def scene_of(model: Model) -> Scene:
     for i, part in enumerate(model.parts):
         channel = model.survey.channels[part.channel]
         split = model.of(part.channel).index(i)
-        waves: dict[str, tuple[Map, ...]] = {}
-        for name, values in WAVES.items() if timed else ():
-            acting = [_wave(*values.items(), component=c)(amplitude=1.0) for c in range(1 if name == "trend" else 2)]
-            waves[name] = tuple(signal_of(one, channel.site, run.map.span(split)) for one in acting)
+        named = WAVES.items() if timed else ()
+        waves = {name: _waves(model, i, values) for name, values in named}
         kernel = channel.site.beam.blm[0, : model.lmax + 1].real
         measured = part.moments.w[: model.settings.beam_orders]
         moments = np.where(np.isfinite(measured), measured, 0.0)
@@ -81,7 +97,8 @@ def scene_of(model: Model) -> Scene:
         grid = MapGrid(model.nside, model.frame, run.map.span(split))
         seen = _elsewhere(channel.site.pointed("elsewhere"), grid, elsewhere[part.channel]) if timed else {}
         response = model.response[part.channel]
-        views.append(View(part.channel, split, moments, waves, seen, part.precision, response, kernel))
+        moving = _moving(channel.site.pointed("a beam"), grid) if timed else {}
+        views.append(View(part.channel, split, moments, waves, moving, seen, part.precision, response, kernel))
     return Scene(
         channels=model.channels,
         frequencies=tuple(channel.site.frequency_ghz for channel in model.survey.channels),
@@ -95,7 +112,55 @@ def scene_of(model: Model) -> Scene:
         split_orders=model.settings.split_beam_orders,
         views=tuple(views),
         elsewhere=tuple(elsewhere),
+        time_lines=tuple(_time_line(model, channel) for channel in range(len(model.channels))) if timed else (),
     )
+
+
+def with_periods(model: Model, scene: Scene, periods_s: Sequence[float]) -> Scene:
+    """Return a scene that has waves of these periods besides."""
+    views = []
+    for i, view in enumerate(scene.views):
+        more = {f"period {one!r}": _waves(model, i, {"wave": "period", "period_s": one}) for one in periods_s}
+        views.append(replace(view, waves={**view.waves, **more}))
+    return replace(scene, views=tuple(views))
+
+
+def _waves(model: Model, i: int, values: Mapping[str, Any]) -> tuple[Map, ...]:
+    """Return the means of cosine and sine of a wave, or of a trend, over the samples of every pixel of a map."""
+    channel, split = model.parts[i].channel, model.of(model.parts[i].channel).index(i)
+    site, span = model.survey.channels[channel].site, model.survey.config.map.span(split)
+    components = range(1 if values["wave"] == "trend" else 2)
+    return tuple(signal_of(_wave(*values.items(), component=c)(amplitude=1.0), site, span) for c in components)
+
+
+def _time_line(model: Model, channel: int) -> TimeLine:
+    """Return when the maps of a channel are observed."""
+    members, site, run = model.of(channel), model.survey.channels[channel].site, model.survey.config
+    pointing = site.pointed("a time line")
+    period = pointing.model.period_of_samples(pointing.line)
+    span_s = max(SHORTEST_S / SPANS, period)
+    shape = int(np.ceil(pointing.model.duration_days * SECONDS_PER_DAY / span_s)), 12 * model.nside**2
+    visits, weights = [], dict[str, list[Map]]({on: [] for on in PERIODIC})
+    sky = sky_variance(model.cl * model.sky_power, model.response[channel])
+    dipole = np.asarray(site.dipole_uk) @ np.stack(healpy.pix2vec(model.nside, np.arange(shape[1])))
+    for split, i in enumerate(members):
+        grid = MapGrid(model.nside, model.frame, run.map.span(split))
+        total = csr_matrix(shape)
+        for chunk in samples(*_thinned(pointing, grid, VISITS), grid, angles=False):
+            spans = np.minimum((chunk.time_s / span_s).astype(int), shape[0] - 1)
+            total += csr_matrix((np.ones(len(spans)), (spans, chunk.pixel)), shape)
+        visits.append(total @ diags(divided(1.0, total.sum(axis=0).A1)))
+        for on, square in zip(PERIODIC, (1.0, dipole**2 + sky), strict=True):
+            weights[on].append(model.parts[i].precision * square)
+    return TimeLine.of(tuple(visits), span_s, weights)
+
+
+def _thinned(pointing: Pointing, grid: MapGrid, most: int) -> tuple[ScanModel, LineOfSight]:
+    """Return a scan and its line of sight with ``most`` samples in a map, about, or as many as there are."""
+    period = pointing.model.duration_days * SECONDS_PER_DAY * np.ptp(grid.time_range) / most
+    if period <= pointing.model.period_of_samples(pointing.line):
+        return pointing.model, pointing.line
+    return pointing.model.with_sampling(period), replace(pointing.line, sample_period_s=None)
 
 
 def directions(own: tuple[float, float], lines: Mapping[str, tuple[float, float]]) -> dict[str, Matrix]:
@@ -119,10 +184,7 @@ def directions(own: tuple[float, float], lines: Mapping[str, tuple[float, float]
 
 def _elsewhere(pointing: Pointing, grid: MapGrid, wanted: Mapping[str, Matrix]) -> dict[str, csr_matrix]:
     """Return the mean over the samples of every coarse pixel of what a map has in other directions."""
-    period = pointing.model.duration_days * SECONDS_PER_DAY * np.ptp(grid.time_range) / SAMPLES
-    model, line = pointing.model, pointing.line
-    if period > model.period_of_samples(line):
-        model, line = model.with_sampling(period), replace(line, sample_period_s=None)
+    model, line = _thinned(pointing, grid, SAMPLES)
     nside = coarse(grid.nside)
     total = {name: csr_matrix((12 * nside**2, 12 * nside**2)) for name in wanted}
     for chunk in samples(model, line, replace(grid, nside=nside)):
@@ -135,6 +197,23 @@ def _elsewhere(pointing: Pointing, grid: MapGrid, wanted: Mapping[str, Matrix]) 
     return {name: diags(divided(1.0, hits)) @ one for name, one in total.items()}
 
 
+def _moving(pointing: Pointing, grid: MapGrid) -> dict[tuple[str, int], NDArray[np.complex128]]:
+    """Return the mean over the samples of every pixel of cos and sin of waves times exp(-i s psi), (2, npix) each."""
+    total = {(wave, s): np.zeros((2, grid.npix), dtype=np.complex128) for wave in MOVING for s in range(1, MOVED + 1)}
+    hits = np.zeros(grid.npix)
+    for chunk in samples(*_thinned(pointing, grid, VISITS), grid):
+        year = 2.0 * np.pi * chunk.time_s / pointing.model.orbit_period_s
+        phases = {"year": year, "spin": spin_phase(pointing, chunk.time_s)}
+        hits += np.bincount(chunk.pixel, minlength=grid.npix)
+        for (wave, s), both in total.items():
+            name, harmonic = wave.split()
+            for row, function in zip(both, (np.cos, np.sin), strict=True):
+                value = function(int(harmonic) * phases[name]) * np.exp(-1j * s * chunk.psi)
+                row.real += np.bincount(chunk.pixel, value.real, grid.npix)
+                row.imag += np.bincount(chunk.pixel, value.imag, grid.npix)
+    return {key: both * divided(1.0, hits) for key, both in total.items()}
+
+
 @lru_cache(maxsize=64)
 def _wave(*values: tuple[str, Any], component: int) -> type[AddedToSamples]:
     """Return the effect with these class variables that adds one of its two components."""
@@ -145,19 +224,26 @@ def _wave(*values: tuple[str, Any], component: int) -> type[AddedToSamples]:
 
 def scores_of_maps(model: Model, scene: Scene, maps: Sequence[Map]) -> Vector:
     """Return the scores of the grammar, shape (P,)."""
-    filtered = wiener_filter(model, maps)
-    return scene.values(filtered)
+    return scene.values(wiener_filter(model, maps))
 
 
 def scores(job: Job) -> Matrix:
-    """Return the scores of the simulations of a job, shape (count, P): the task that a worker runs."""
+    """Return the scores of the simulations of a job, shape (count, P): the task that a worker runs.
+
+    Behind them stand the falls of chi^2 of peaks, if the job names no periods.
+    """
     model, scene = analysis_for(job).model, scene_for(job)
-    return np.stack([scores_of_maps(model, scene, maps) for maps in simulated_maps(job)])
+    filtered = (wiener_filter(model, maps) for maps in simulated_maps(job))
+    return np.stack([np.append(scene.values(one), [] if job.periods_s else _falls(scene, one)) for one in filtered])
+
+
+def _falls(scene: Scene, filtered: FilteredMaps) -> list[float]:
+    return [one.fall for one in scene.peaks(filtered).values()]
 
 
 def scene_for(job: Job) -> Scene:
-    """Return the scene of the model of a job; the last one is kept."""
-    return _scene(*job.definition)
+    """Return the scene of the model of a job, with waves of its periods; the last one of a model is kept."""
+    return with_periods(analysis_for(job).model, _scene(*job.definition), job.periods_s)
 
 
 @lru_cache(maxsize=1)
@@ -166,16 +252,45 @@ def _scene(fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings,
     return scene_of(analysis_for(job).model)
 
 
-def null_scores(analysis: Analysis, ask: Ask) -> Matrix:
-    """Return the scores of simulations of the model, shape (SIMULATIONS, P), simulated or from the cache."""
+def search_of(analysis: Analysis, scene: Scene, ask: Ask) -> Search:
+    """Return the search of the maps of a model."""
+    null, count = null_scores(analysis, ask), len(scene.keys)
+    return Search(structures(scene), null[:, :count], _charged(scene, null[:, count:]))
+
+
+def _charged(scene: Scene, falls: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the evidences of peaks from their falls of chi^2, shape (..., peaks), all frequencies charged."""
+    return evidence(falls, 2) - np.log([line.tried for line in scene.time_lines for _ in PERIODIC])
+
+
+def with_peaks(analysis: Analysis, scene: Scene, search: Search, maps: Sequence[Map], ask: Ask) -> tuple[Scene, Search]:
+    """Return scene and search with the periods that are significant by themselves, the most evident first, if any.
+
+    Periods are the same if they are so over the survey within half a cycle.
+    """
+    found = list(scene.peaks(wiener_filter(analysis.model, maps)).values())
+    evidences, periods = _charged(scene, np.array([one.fall for one in found])), [one.period_s for one in found]
+    chosen = list[float]()
+    for k in np.argsort(-evidences):
+        apart = [abs(1.0 / periods[k] - 1.0 / one) * scene.time_lines[0].duration_s for one in chosen]
+        if search.pvalue(evidences[k]) <= LEVEL and min(apart, default=np.inf) > 0.5:
+            chosen.append(periods[k])
+    if not chosen:
+        return scene, search
+    more = with_periods(analysis.model, scene, chosen)
+    return more, Search(structures(more), null_scores(analysis, ask, tuple(chosen)), search.peaks)
+
+
+def null_scores(analysis: Analysis, ask: Ask, periods_s: tuple[float, ...] = ()) -> Matrix:
+    """Return :func:`scores` of SIMULATIONS simulations of the model, simulated or from the cache."""
     run = analysis.run
     science = config.science(run, *(("nuisance",) if run.nuisances else ()))
-    identity = [science | {"ensemble": {}}, SIMULATIONS, package_digest(f"mcsim.{name}" for name in CODE)]
+    identity = [science | {"ensemble": {}}, SIMULATIONS, periods_s, package_digest(f"mcsim.{name}" for name in CODE)]
     identity.append(asdict(replace(analysis.settings, without=(), including=())))
     key = hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
     def fill(folder: Path) -> None:
-        job = replace(analysis.job(seeded(run, SEED)), nuisances=bool(run.nuisances))
+        job = replace(analysis.job(seeded(run, SEED)), nuisances=bool(run.nuisances), periods_s=periods_s)
         starts = range(0, SIMULATIONS, PER_TASK)
         jobs = [replace(job, first=k, count=min(PER_TASK, SIMULATIONS - k)) for k in starts]
         np.save(folder / "scores.npy", np.concatenate(ask(jobs)))

@@ -10,7 +10,7 @@ from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import Library
 from mcsim.systematics.base import scan_direction
 
-_DERIVATIVES = {2: "second derivative", 3: "third derivative", 4: "fourth derivative"}
+_DERIVATIVES = {1: "gradient", 2: "second derivative", 3: "third derivative", 4: "fourth derivative"}
 
 _LIKE: tuple[tuple[str, str, str, str], ...] = (
     ("beam", "scan", "order 0 at low l", "beam_sidelobe"), ("beam", "scan", "order 0", "beam_width"),
@@ -55,13 +55,21 @@ def _what(structure: Structure, theta: Vector) -> str:
     kind, number = structure.kind, structure.kind.rpartition(" ")[2]
     on = structure.acts_on.replace("sky and dipole", "sky and dipole alike")
     match structure.stage, structure.frame:
+        case "added", "sky" if kind.startswith("orientation"):
+            _, order, degrees = kind.split(maxsplit=2)
+            turns = f"turns with the beam (order {order}, {_pattern(degrees)})"
+            return f"is added to the signal, fixed to the sky, and {turns}"
         case "added", "sky":
             return f"is added to the signal, fixed to the sky ({_pattern(kind)})"
         case "added", "spacecraft" if kind == "lobe":
             return f"is the dipole as a lobe fixed to the spacecraft sees it, {_lobe(theta)}"
         case "added", "spacecraft" if kind == "Galaxy":
             return "is added to the signal as the Galaxy is in a lobe fixed to the spacecraft"
+        case "added", "spacecraft" if kind.startswith("degrees"):
+            return f"is added to the signal as a sky ({_pattern(kind)}) is in a lobe fixed to the spacecraft"
         case "added", "Sun":
+            if kind.startswith("crossing"):
+                return f"is added to the signal as by the Sun in a lobe, at {kind.split()[1]}° of the spin"
             return f"is added to the signal and depends on {SUN[kind]}"
         case "added", "spacecraft" if kind.startswith("line"):
             return f"is the dipole as the line of sight of {number} sees it at the same time"
@@ -79,8 +87,11 @@ def _what(structure: Structure, theta: Vector) -> str:
             return f"is proportional to {on}, with a pattern fixed to the sky ({_pattern(kind)})"
         case "gain", _:
             return f"is proportional to {on}"
+        case "beam", _ if structure.moving:
+            change = "a change of the beam's width" if kind.startswith("order 0") else _derivative(structure.order)
+            return f"follows {change} that varies with the {_wave(structure.moving)}"
         case "beam", _:
-            return _order(int(kind.split()[1]), theta)
+            return _order(structure.order, theta)
         case "square", _:
             return f"follows the square of {structure.acts_on}"
         case "cube", _:
@@ -104,14 +115,18 @@ def _order(order: int, theta: Vector) -> str:
     # b_lm of a beam turned by a has the phase e^(-i m a); a displacement along x has b_l1 < 0, a stretch b_l2 > 0.
     total = complex(np.sum(theta.reshape(-1, 2) @ [1.0, 1j])) * (-1) ** order
     angle = -np.rad2deg(np.angle(total)) / order
-    name = "gradient" if order == 1 else _DERIVATIVES[order]
-    return f"follows the {name} of the sky {scan_direction(angle, 360.0 / order)}"
+    return f"follows {_derivative(order)} {scan_direction(angle, 360.0 / order)}"
+
+
+def _derivative(order: int) -> str:
+    return f"the {_DERIVATIVES[order]} of the sky"
 
 
 def _pattern(kind: str) -> str:
     first, _, rest = kind.partition(" ")
     if first == "latitude":
-        return f"by {rest} latitude"
+        pole, _, degrees = rest.partition(" ")
+        return f"by {pole} latitude" + (f", {_pattern(f'degrees {degrees}')}" if degrees else "")
     if first in ("degrees", "degree"):
         return f"ℓ {rest.replace('-', '–')}"
     return {"power": "pattern not known, by its power in ℓ"}.get(kind, kind)
@@ -133,6 +148,13 @@ def _wave(kind: str) -> str:
         return "time, growing steadily"
     if wave == "month":
         return "month"
+    if wave == "period":
+        seconds, name = float(harmonic), "day"
+        for unit, size in (("day", 86400.0), ("hour", 3600.0), ("minute", 60.0)):
+            name, number = unit, seconds / size
+            if number >= 2.0:
+                break
+        return f"time, with a period of {number:.4g} {name}s"
     often = {ANY: ", in any way", "1": ""}.get(harmonic, f", {_TIMES.get(harmonic)} a {wave}")
     return ("year" if wave == "year" else "spin phase") + often
 
@@ -188,8 +210,8 @@ def _where(structure: Structure, scene: Scene) -> list[str]:
 
 def profile_ranges(structure: Structure, scene: Scene) -> list[tuple[int, int]] | None:
     """Return the ranges of degrees, both ends included, of a structure with a profile in l; None for others."""
-    if structure.stage == "beam":
-        edges = scene.edges(max(int(structure.kind.split()[1]), 1))
+    if structure.stage == "beam" and not structure.moving:
+        edges = scene.edges(max(structure.order, 1))
     elif structure.kind in ("power", "spectrum"):
         edges = scene.fine
     else:

@@ -34,7 +34,7 @@ class Result:
 def test_what_held_out_data_refute_is_not_told(monkeypatch, before, after, predicted, told) -> None:
     """It raises the excess, or removes nothing where it should; where little is forecast nothing is refuted."""
     found, reduction = (SimpleNamespace(says="is noise, W alone"),), held_out(before, after, predicted)
-    for name in ("scene_for", "structures", "null_scores", "Search"):
+    for name in ("scene_for", "search_of"):
         monkeypatch.setattr(unlisted, name, lambda *_: None)
     monkeypatch.setattr(unlisted, "structures_of", lambda *_: (found, reduction))
     analysis = SimpleNamespace(job=lambda _: None, run=None, settings=DiagnosisSettings())

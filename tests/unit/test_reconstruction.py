@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
+from types import SimpleNamespace
 
 import healpy
 import numpy as np
@@ -15,6 +16,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import model_of, wiener_filter
 from mcsim.diagnosis import api
 from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan import MapGrid
 from mcsim.instrument.scan.pointing import pointing
 from mcsim.reconstruction import forms, simulated_scores, words
 from mcsim.reconstruction.figure import structure_figure
@@ -22,7 +24,7 @@ from mcsim.reconstruction.grammar import ALIKE, ANY, Structure, structures
 from mcsim.reconstruction.plugin import Plugin, plugin
 from mcsim.reconstruction.result import Reconstructed
 from mcsim.reconstruction.search import ALTERNATIVES, LEVEL, MOST, Search, evidence
-from mcsim.simulation import simulate
+from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
@@ -39,7 +41,7 @@ def seen():
     run = config.load(MODEL)
     model = model_of(survey(run, orders=4), DiagnosisSettings())
     maps = list(simulate.maps(model.survey, 7))
-    scene = simulated_scores.scene_of(model)
+    scene = simulated_scores.with_periods(model, simulated_scores.scene_of(model), [5640.0])
     return run, scene, wiener_filter(model, maps), simulated_scores.scores_of_maps(model, scene, maps)
 
 
@@ -76,6 +78,8 @@ TOLERANCE = {
         ("added", "sky", "degrees 0-4", "half2"),
         ("added", "sky", "dipole", "opposite"),
         ("added", "sky", "latitude galactic", ALIKE),
+        ("added", "sky", "latitude ecliptic 0-2", "half1"),
+        ("added", "sky", "quadrupole", ALIKE),
         ("added", "spacecraft", "orientation 1", ALIKE),
         ("added", "spacecraft", "orientation 2", "half1"),
         ("added", "time", "year 1", ALIKE),
@@ -95,7 +99,12 @@ TOLERANCE = {
         ("elsewhere", "spacecraft", "opposite", ALIKE),
         ("elsewhere", "spacecraft", "lag", ALIKE),
         ("added", "spacecraft", "Galaxy", "half1"),
+        ("added", "spacecraft", "degrees 0-2", "half2"),
+        ("added", "sky", "orientation 1 degree 1", ALIKE),
+        ("added", "sky", "orientation 2 degrees 2-4", "opposite"),
         ("added", "time", "month", ALIKE),
+        ("added", "time", "period 5640.0", "half2"),
+        ("gain", "time", "period 5640.0", ALIKE),
         ("elsewhere", "spacecraft", "spin -1/4", ALIKE),
         ("beam", "scan", "order 0", ALIKE),
         ("beam", "scan", "order 1", ALIKE),
@@ -109,6 +118,7 @@ TOLERANCE = {
         ("added", "spacecraft", "line V1", ALIKE),
         ("added", "Sun", "dipole", "half1"),
         ("added", "Sun", "elongation", ALIKE),
+        ("added", "Sun", "crossing 285 8", ALIKE),
         ("added", "spacecraft", "lobe", ALIKE),
         ("beam", "scan", "order 0 at low l", ALIKE),
         ("rotation", "sky", "rotation", ALIKE),
@@ -154,6 +164,36 @@ def test_a_rotation_moves_the_map():
         np.testing.assert_allclose(found, moved, atol=1e-3 * np.abs(moved).max())
 
 
+@pytest.mark.parametrize("kind", ["order 0 year 1", "order 1 spin 1", "order 2 spin 2"])
+def test_a_score_of_a_beam_that_moves_is_the_product_with_its_maps(kind):
+    _, scene, filtered, u = seen()
+    structure = next(w for w in grammar() if (w.kind, w.channel, w.split) == (kind, "W1", "half2"))
+    theta = np.random.default_rng(4).normal(size=structure.size)
+    added = scene.moved(structure.moving, structure.order, theta, filtered.sky)[3]
+    np.testing.assert_allclose(filtered.residual[3] @ added, theta @ structure.of(u), rtol=1e-9)
+    assert plugin("unlisted_1", structure, theta, scene) is None
+
+
+def test_a_pointing_that_nods_moves_the_dipole():
+    """A displacement along the beam's x axis, cos(spin phase) of it, adds the dipole's change to every sample."""
+    run, scene, filtered, _ = seen()
+    site, span = survey(run).channels[1].site, run.map.span(1)
+    model, line = site.pointing.model, site.pointing.line
+
+    def change(chunk):
+        _, south, east = spacecraft.axes(chunk.theta, chunk.phi)
+        along = np.cos(chunk.psi) * south + np.sin(chunk.psi) * east
+        return np.cos(spacecraft.spin_phase(site.pointing, chunk.time_s)) * (scene.dipole_uk @ along)
+
+    stream = tod.with_signal(change)(tod.samples(model, line, MapGrid(NSIDE, "ecliptic", span)))
+    expected, hits = tod.bin_samples(stream, NSIDE)
+    (view,) = (view for view in scene.views if (view.channel, view.split) == (1, 1))
+    unit = np.array([LMAX, 0.0, 0.0, 0.0]) / view.response[1]
+    found = scene.moved("spin 1", 1, unit, np.zeros_like(filtered.sky))[3]
+    difference = (found - expected)[hits > 0]  # samples are not at the centres of pixels
+    assert np.std(difference) < 0.05 * np.std(expected[hits > 0])
+
+
 def test_another_channel_sees_the_dipole_where_its_line_of_sight_points():
     """The dipole in the frame of one beam, seen along the line of another, is the dipole of that line's pointing."""
     run, scene, _, _ = seen()
@@ -166,6 +206,23 @@ def test_another_channel_sees_the_dipole_where_its_line_of_sight_points():
     np.testing.assert_allclose(effect.signal(time_s, *own, sites[1]), expected, atol=1e-6)
 
 
+def test_a_direction_along_the_beam_is_a_pattern_of_spin_1():
+    """b . x with a fixed vector b is the gradient of b . n along x, thus E of degree 1: Q = b . e_theta."""
+    site = survey(seen()[0]).channels[1].site
+    b, draw = np.array([0.5, 0.3, 0.81]), np.random.default_rng(1).uniform(size=(3, 2000))
+    theta, phi, psi = np.arccos(1.0 - 2.0 * draw[0]), 2.0 * np.pi * draw[1], 2.0 * np.pi * draw[2]
+    _, south, east = spacecraft.axes(theta, phi)
+    structure = next(w for w in grammar() if w.kind == "orientation 1 degree 1" and w.channel == "W1")
+    expected = b @ (np.cos(psi) * south + np.sin(psi) * east)
+    made = [
+        plugin("unlisted_1", structure, theta_, seen()[1]).kind()(amplitude=1.0).signal(psi, theta, phi, psi, site)
+        for theta_ in np.eye(6)
+    ]
+    fitted = np.linalg.lstsq(np.array(made).T, expected, rcond=None)[0]
+    assert np.std(fitted @ made - expected) < 0.005 * np.std(expected)  # a pixel at a pole holds all directions
+    np.testing.assert_allclose(fitted[3:], 0.0, atol=0.01 * np.abs(fitted).max())
+
+
 def test_orientations_are_those_of_the_pointing():
     """A gain takes times alone: psi follows from the rotations of the scan."""
     site = survey(seen()[0]).channels[1].site
@@ -174,6 +231,36 @@ def test_orientations_are_those_of_the_pointing():
         expected = pointing(site.pointing.model, site.pointing.line, 1000, 50, frame)[2]
         found = spacecraft.orientation(site.pointing, time_s, frame)
         np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * expected), atol=1e-7)
+
+
+def test_a_period_that_stands_out_is_searched(monkeypatch):
+    """A wave in the samples of one channel adds its period to the words; maps of the model add none."""
+    run, scene, _, _ = seen()
+    model = model_of(survey(run, orders=4), DiagnosisSettings())
+    simulations = np.random.default_rng(3).normal(size=(400, len(scene.keys)))
+    asked = []
+
+    def null_scores(analysis, ask, periods_s):
+        asked.append(periods_s)
+        return simulations
+
+    monkeypatch.setattr(simulated_scores, "null_scores", null_scores)
+    search = Search(grammar(), simulations, np.random.default_rng(4).normal(size=(400, 4)) - 3.0)
+    analysis = SimpleNamespace(model=model)
+    maps = list(simulate.maps(model.survey, 8))
+    assert simulated_scores.with_peaks(analysis, scene, search, maps, None) == (scene, search)
+    period = 7321.0
+    waves = simulated_scores.with_periods(model, scene, [period])
+    for i in (2, 3):
+        wave = waves.views[i].waves[f"period {period!r}"][0]
+        maps[i] = maps[i] + 12.0 * wave / np.sqrt(np.sum(model.parts[i].precision * wave**2))
+    more, wider = simulated_scores.with_peaks(analysis, scene, search, maps, None)
+    found = asked[-1][0]  # the most evident; a gain may be told by side bands of the same wave
+    assert abs(1.0 / found - 1.0 / period) < 0.25 / scene.time_lines[1].duration_s
+    assert f"period {found!r}" in more.views[2].waves
+    words_ = [w for w in wider.grammar if w.kind == f"period {found!r}"]
+    assert {w.channel for w in words_} == {"V1", "W1", None}
+    assert all(w.tried == scene.time_lines[0].tried for w in words_)
 
 
 @pytest.mark.parametrize("on_sky", [True, False])
@@ -306,6 +393,41 @@ def test_what_is_there_is_found_with_its_size():
     assert abs(sigma[0, 0] * covariance[2, 2] - 1.0) < 5.0 * np.sqrt(2.0 / 400)
     response = (x - simulations.mean(axis=0)) / 2.0
     assert np.allclose(search.amplitudes([chosen[2]], x, response[None]), [2.0])
+
+
+def test_a_choice_among_many_is_charged():
+    """Odds of one among n are shared by all, and what others had been chosen in simulations counts in p-values."""
+    chosen, simulations, _ = toy(400)
+    among = tuple(replace(one, tried=1e4) for one in chosen)
+    x = 20.0 * simulations[0]
+    plain_, charged = (Search(one, simulations).evidences(x) for one in (chosen, among))
+    np.testing.assert_allclose(plain_ - charged, np.log(1e4))
+    search = Search(chosen, simulations)
+    wider = replace(search, peaks=np.full((400, 1), search.largest.max() + 1.0))
+    assert search.pvalue(float(search.largest.max()) + 0.5) < 1.0 / 400
+    assert wider.pvalue(float(search.largest.max()) + 0.5) == 1.0
+
+
+def test_of_many_that_the_data_choose_among_the_best_is_compared():
+    chosen, simulations, _ = toy(400)
+    among = tuple(replace(one, stage="any", tried=12.0) for one in chosen[:12])
+    search = Search((*among, *chosen[12:]), simulations)
+    values = np.arange(1.0, 15.0)
+    assert search.finalists(values)[:2] == [13, 12]
+    assert [k for k in search.finalists(values) if k < 12] == [11]
+
+
+def test_the_sun_in_a_lobe_is_a_von_mises_function():
+    """Six harmonics of exp(2 (cos x - 1)) are that function to 1e-4, and of the narrower one to 5 %."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 100)
+    for narrow, tolerance in ((2, 1e-4), (8, 0.05)):
+        structure = next(w for w in grammar() if w.kind == f"crossing 285 {narrow}")
+        constant, none, *waves = plugin("unlisted_1", structure, np.ones(1), seen()[1]).values["coefficients"]
+        assert none == 0.0
+        k = np.arange(1, len(waves) // 2 + 1)[:, None]
+        found = constant + waves[::2] @ np.cos(k * turn) + waves[1::2] @ np.sin(k * turn)
+        expected = np.exp(narrow * (np.cos(turn - np.deg2rad(285.0)) - 1.0))
+        np.testing.assert_allclose(found, expected, atol=tolerance)
 
 
 def test_evidence_falls_with_the_number_of_coordinates():

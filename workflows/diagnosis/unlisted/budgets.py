@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import healpy
 import numpy as np
-from unlisted import ANY, ask, known, row
+from unlisted import ANY, ask, known, row, scored
 
 from mcsim.diagnosis import unlisted
 from mcsim.diagnosis.observed_maps import ObservedMaps
@@ -216,7 +216,7 @@ def main(span="0:24", cases=CASES, first=95_000):
 
         factor = factor_of(snr, wanted)
         data = ObservedMaps(sky.context, list(sky.maps + factor * change), ask)
-        found, reduction = unlisted.structures_of(data, sky.scene, sky.search)
+        found, reduction = unlisted.structures_of(data, sky.scene, sky.search, scored)
         owner = None if case.common else sky.run.channels[channel].name
         # Of several truths that is scored with which most words of the first description are right.
         said = [] if not found else [found[0].stage, found[0].frame, found[0].kind, found[0].split]

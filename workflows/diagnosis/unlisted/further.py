@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import healpy
 import numpy as np
-from unlisted import ANY, ask, known, row
+from unlisted import ANY, ask, known, row, scored
 
 from mcsim import config
 from mcsim.diagnosis import unlisted
@@ -199,7 +199,7 @@ def main(span="0:99"):
         for _ in range(4):
             factor *= wanted / null.expected_snr(analysis.data_vector(list(sky.maps + factor * change)) - before)
         data = ObservedMaps(sky.context, list(sky.maps + factor * change), ask)
-        found, reduction = unlisted.structures_of(data, sky.scene, sky.search)
+        found, reduction = unlisted.structures_of(data, sky.scene, sky.search, scored)
         owner = None if channel is None else sky.run.channels[channel].name
         row("further", make.__name__, truth, owner, split, wanted, "", found, reduction)
 

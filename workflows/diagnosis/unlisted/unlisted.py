@@ -26,8 +26,6 @@ from mcsim.diagnosis import unlisted
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.reconstruction import simulated_scores
-from mcsim.reconstruction.grammar import structures
-from mcsim.reconstruction.search import Search
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.stats.intervals import removed, share
@@ -83,9 +81,13 @@ FOREIGN = {
 def known(which):
     """Return run, context, scene and search of a model."""
     run, context = learned({"one": ONE, "two": MODEL}[which])
-    null = simulated_scores.null_scores(context.analysis, lambda jobs: [simulated_scores.scores(job) for job in jobs])
     scene = simulated_scores.scene_of(context.analysis.model)
-    return run, context, scene, Search(structures(scene), null)
+    return run, context, scene, simulated_scores.search_of(context.analysis, scene, scored)
+
+
+def scored(jobs):
+    """Return the scores of jobs, computed in this process."""
+    return [simulated_scores.scores(job) for job in jobs]
 
 
 def row(kind, name, truth, channel, split, strength, verdict, found, reduction):
@@ -119,7 +121,8 @@ def null(number):
         shared, model = survey(run), context.analysis.model
         for case in range(int(number) // 2):
             maps = list(simulate.maps(shared, 50_000 + case))
-            found = search.run(simulated_scores.scores_of_maps(model, scene, maps))
+            more, wider = simulated_scores.with_peaks(context.analysis, scene, search, maps, scored)
+            found = wider.run(simulated_scores.scores_of_maps(model, more, maps))
             x = context.analysis.data_vector(maps)
             p = global_test(context.null, x, context.groups, context.calibration).pvalue
             print(json.dumps(["null", which, p, [one.pvalue for one in found]]), flush=True)
@@ -164,7 +167,7 @@ def library(each, span="0:99"):
                 print(json.dumps(["left out", name, str(error)]), flush=True)
                 continue
             maps = list(simulate.maps(acting, seed))
-            found, reduction = unlisted.structures_of(ObservedMaps(context, maps, ask), scene, search)
+            found, reduction = unlisted.structures_of(ObservedMaps(context, maps, ask), scene, search, scored)
             row("library", name, truth, owner, "alike", strength, "", found, reduction)
 
 
@@ -189,7 +192,7 @@ def foreign(cases, diagnosed="no"):
         owner = run.channels[channel].name
         data = ObservedMaps(context, maps, ask)
         verdict = diagnose_data(data, f"case-{case}").kind if diagnosed == "yes" else ""
-        found, reduction = unlisted.structures_of(data, scene, search)
+        found, reduction = unlisted.structures_of(data, scene, search, scored)
         row("foreign", name, FOREIGN[kind], owner, split, wanted, verdict, found, reduction)
 
 
