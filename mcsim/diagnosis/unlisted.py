@@ -163,6 +163,8 @@ class Reconstruction:
             structure = self.search.grammar[k]
             ((theta, _),) = self.search.fit([structure], rest)
             each = theta[None]
+            if structure.has_phase:
+                each = self._turned(structure, theta, rest)[None]
             if structure.by_coordinate:
                 each = float(np.linalg.norm(theta)) * np.eye(structure.size)
             shape, share = structure, None
@@ -179,6 +181,15 @@ class Reconstruction:
                 found[row] = np.stack(rows) - self.before.scores
             self._trial[k] = each, found[row]
         return found
+
+    def _turned(self, structure: Structure, theta: Vector, rest: Vector) -> Vector:
+        """Return coordinates of which simulated responses, of each by itself, make the structure's own scores."""
+        each = float(np.linalg.norm(theta)) * np.eye(structure.size)
+        effects = [plugin("unlisted", structure, one, self.scene) for one in each]
+        if None in effects:
+            return theta
+        made = np.stack([self.simulated([one]).scores for one in effects if one is not None]) - self.before.scores
+        return np.asarray(self.search.amplitudes([structure], rest, made) @ each)
 
     def _moved(self, structure: Structure, theta: Vector) -> Vector:
         """Return what a beam that follows a wave makes of all scores, on skies that the data constrain."""

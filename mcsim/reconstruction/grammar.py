@@ -97,6 +97,11 @@ class Structure:
         alike = (other.acts_on, other.channel, other.split, other.index) == same
         return other.stage in stage and other.kind == mean and alike
 
+    def beside(self, other: "Structure") -> bool:
+        """Return True if another varies with the same in the same maps, whatever it multiplies and how often."""
+        mine, theirs = ((one.stage, one.frame, one.kind.split()[0], *one.says[4:]) for one in (self, other))
+        return mine == theirs
+
     @property
     def choice(self) -> tuple[str | None, ...]:
         """Return what is the same of structures among which the data choose; nothing for others."""
@@ -117,6 +122,14 @@ class Structure:
     def by_coordinate(self) -> bool:
         """Return True for a pattern of few coordinates that multiplies the sky: each has a response of its own."""
         return self.frame == "sky" and bool(self.acts_on) and self.size <= FREE
+
+    @property
+    def has_phase(self) -> bool:
+        """Return True for a gain that follows one wave: its phase is found by the responses of cosine and sine.
+
+        Where the filter leaves uneven noise the scatter of its scores is not their response.
+        """
+        return (self.stage, self.frame, self.size) == ("gain", "time", 2)
 
     def elsewhere(self, other: "Structure") -> bool:
         """Return True if another is the same in another channel or split, or in all channels by their frequency."""

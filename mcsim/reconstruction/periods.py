@@ -80,4 +80,5 @@ class TimeLine:
         before, here, after = np.log(power[best - 1 : best + 2])
         curved = before - 2.0 * here + after
         between = 0.5 * (before - after) / curved if curved < 0.0 else 0.0
-        return Peak(1.0 / (step * (best + np.clip(between, -0.5, 0.5))), float(2.0 * ratio[best - first]))
+        place = best + float(np.clip(between, -0.5, 0.5))
+        return Peak(1.0 / (step * place), float(2.0 * ratio[best - first]))

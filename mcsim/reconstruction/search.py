@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.reconstruction.grammar import ALIKE, Structure
+from mcsim.reconstruction.grammar import ALIKE, ANY, Structure
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 
@@ -193,7 +193,8 @@ class Search:
         """Return structures to compare: the most evident one, and those that may be it on this sky.
 
         These are the best of every other stage, the same in other channels, splits or profiles, whose own scores do not
-        tell all that they do to the others, those near it, and the best of every frame. Of many among which the data
+        tell all that they do to the others, the same function of something else and with fewer harmonics, those near
+        it, and the best of every frame. Of many among which the data
         choose it is the best. All their scores together have as many elements as a fraction 1/SPARE of the simulations
         at most.
         """
@@ -208,6 +209,8 @@ class Search:
         wanted += [self.constants[k] for k in order[:1] if k in self.constants]
         wanted += _firsts(order, [one.stage for one in each])
         wanted += [k for k in order if each[0].elsewhere(self.grammar[k]) or each[0].like(self.grammar[k])]
+        beside = [k for k in order if each[0].beside(self.grammar[k])]
+        wanted += _firsts(beside, [(self.grammar[k].acts_on, self.grammar[k].kind.endswith(ANY)) for k in beside])
         wanted += [k for k in order if values[order[0]] - values[k] < NEAR]
         wanted += _firsts(order, [(one.stage, one.acts_on, one.frame) for one in each])
         chosen, rows = list[int](), 0

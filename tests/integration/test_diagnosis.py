@@ -106,8 +106,10 @@ def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small, tmp_path)
 
 
 def test_an_unlisted_effect_is_described_written_and_shrinks(small, tmp_path, monkeypatch):
-    """A gain that follows the year, which the library of this instrument does not have."""
-    monkeypatch.setattr(simulated_scores, "SIMULATIONS", 200)
+    """A gain that follows the year, which the library of this instrument does not have.
+
+    It multiplies sky and dipole. That of the sky alone is twice its error here: whether it is told is chance.
+    """
     monkeypatch.setattr("sys.path", list(sys.path))
     monkeypatch.setenv("PYTHONPATH", "")
     shared = data_of(small.run, "gain_drift", "W1", amplitude=1.5e-3, phase_deg=40.0)
@@ -118,6 +120,7 @@ def test_an_unlisted_effect_is_described_written_and_shrinks(small, tmp_path, mo
     found = unlisted.reconstructed(before, data, lambda jobs: [simulated_scores.scores(job) for job in jobs])
     first = found.unlisted[0]
     assert (first.stage, first.frame, first.kind, first.channel) == ("gain", "time", "year 1", "W1")
+    assert "sky and dipole" in (first.acts_on, (first.rival or {}).get("acts_on"))
     assert first.pvalue < 1e-4
     assert "annual gain drift" in first.cause
     assert found.unlisted_held_out.achieved.value > 0.5
@@ -133,8 +136,11 @@ def test_an_unlisted_effect_is_described_written_and_shrinks(small, tmp_path, mo
     assert verdict["unlisted"][0]["file"] == "unlisted_1.py"
     assert verdict["unlisted_shrink"]["achieved"] == found.unlisted_held_out.achieved.value
     kind = systematics.get(str(tmp_path / "out" / "unlisted_1.py"))
-    wave = kind(amplitude=1.0).gain(np.linspace(0.0, 3e7, 50), data_of(small.run).channels[1].site)
-    truth = 1.5e-3 * np.cos(2.0 * np.pi * np.linspace(0.0, 3e7, 50) / 31558149.8 - np.deg2rad(40.0))
+    made, times, site = kind(amplitude=1.0), np.linspace(0.0, 3e7, 50), data_of(small.run).channels[1].site
+    theta, phi = (np.full(50, angle) for angle in healpy.vec2dir(site.dipole_uk))
+    of_dipole = made.signal(times, theta, phi, np.zeros(50), site)
+    wave = made.gain(times, site) if of_dipole is None else of_dipole / np.linalg.norm(site.dipole_uk)
+    truth = 1.5e-3 * np.cos(2.0 * np.pi * times / 31558149.8 - np.deg2rad(40.0))
     assert np.sqrt(np.mean((wave - truth) ** 2)) < 4.0 * first.relative_error * np.sqrt(np.mean(truth**2))
     lines = words.summary(found, tmp_path / "out")
     assert sum(line.startswith("missing") for line in lines) == len(found.unlisted) + 1
