@@ -201,10 +201,10 @@ def factor_of(snr, wanted):
     return np.exp(where[-1])
 
 
-def main(span="0:24", cases=CASES, first=95_000):
-    """Scale each of twelve cases to an S/N of the data vector, and print what is said of it."""
-    for number in range(24)[slice(*map(int, span.split(":")))]:
-        case, wanted, sky = cases[number % 12], (10.0, 20.0)[number // 12], Sky(first + number)
+def main(span="0:99", cases=CASES, first=95_000, strengths=(10.0, 20.0)):
+    """Scale each case to every S/N of the data vector in turn, and print what is said of it."""
+    for number in range(len(strengths) * len(cases))[slice(*map(int, span.split(":")))]:
+        case, wanted, sky = cases[number % len(cases)], strengths[number // len(cases)], Sky(first + number)
         channel = None if case.common else int(np.random.default_rng([2032, number]).integers(2))
         change = sky.change(case, range(2) if case.common else [channel])
         before = sky.context.analysis.data_vector(list(sky.maps))
