@@ -13,15 +13,18 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.special import ive, poch
 
+from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.reconstruction.forms import REFERENCE_GHZ
 from mcsim.reconstruction.scores import (
     ACTED_ON,
     ELONGATION,
     GAIN,
     HARMONICS,
+    HISTORY,
     MODULATION,
     MONTH,
     ORDERS,
+    PERIODIC,
     TURNED,
     Key,
     Scene,
@@ -88,7 +91,7 @@ class Structure:
 
     def extends(self, other: "Structure") -> bool:
         """Return True for what has more than its mean, in time or on the sky, if that is the other one."""
-        longer = self.kind in ("elongation", "Galaxy") or self.kind.startswith(("degrees", "latitude"))
+        longer = self.kind in ("elongation", "Galaxy") or self.kind.startswith(("degrees", "latitude", "step"))
         if not longer and not self.kind.endswith(ANY):
             return False
         stage = {"added": ("added", "power")}.get(self.stage, (self.stage,))
@@ -105,7 +108,7 @@ class Structure:
     @property
     def choice(self) -> tuple[str | None, ...]:
         """Return what is the same of structures among which the data choose; nothing for others."""
-        return (*self.says[:3], *self.says[4:6]) if self.tried > 1.0 else ()
+        return (*self.says[:3], self.kind.split()[0], *self.says[4:6]) if self.tried > 1.0 else ()
 
     @property
     def order(self) -> int:
@@ -149,6 +152,8 @@ class Structure:
 
 
 def _briefly(kind: str) -> list[str]:
+    if kind.startswith(HISTORIES):
+        return [HISTORIES[0]]
     return kind.split()[: 1 if kind.startswith(("degrees", "crossing")) else 2]
 
 
@@ -168,6 +173,26 @@ _CROSSINGS = {
     for narrow in NARROW
     for n in range(CROSSINGS)
 }
+
+
+HISTORIES = ("from", "until", "step", "decay", "rise")
+"""What is there from a day on, until a day, has another value from a day on, falls since the start of the survey, or
+rises until its end."""
+
+DECAYS = (1 / 16, 1 / 8, 1 / 4)  #: times in which a decay has fallen by e, as fractions of the survey
+
+
+def _histories(days: float) -> dict[str, Matrix]:
+    """Return the values of functions of a survey's time in its equal parts, shape (1 or 2, HISTORY), by their kind."""
+    found, part = {}, np.arange(HISTORY)
+    for first in range(1, HISTORY):
+        after, day = (part >= first).astype(float), f"{days * first / HISTORY:.4g}"
+        found |= {f"from {day}": after[None], f"until {day}": 1.0 - after[None]}
+        found[f"step {day}"] = np.stack([np.ones(HISTORY), 2.0 * after - 1.0])
+    for lifetime in DECAYS:
+        fallen = np.exp(-part / HISTORY / lifetime)[None]
+        found |= {f"decay {days * lifetime:.3g}": fallen, f"rise {days * lifetime:.3g}": fallen[:, ::-1]}
+    return found
 
 
 def structures(scene: Scene) -> tuple[Structure, ...]:
@@ -224,6 +249,8 @@ def _tried(scene: Scene, kind: str) -> float:
     """Return the number of structures of a kind, or of frequencies, among which the data choose."""
     if kind.startswith("period"):
         return scene.time_lines[0].tried
+    if kind.startswith(HISTORIES):
+        return float(3 * (HISTORY - 1) + 2 * len(DECAYS))
     return float(len(_CROSSINGS)) if kind.startswith("crossing") else 1.0
 
 
@@ -257,7 +284,7 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
                 yield "elsewhere", on, "spacecraft", name, [("elsewhere", name, on)], None
             if name.startswith("line"):
                 yield "added", "dipole", "spacecraft", name, lobe, scene.elsewhere[view.channel][name][:, :3]
-    for on in ("", *ACTED_ON) if split == ALIKE else ("",):
+    for on in ("", *ACTED_ON) if split == ALIKE else PERIODIC:
         yield from _timed(scene, view, on)
     noise: list[Key] = [("noise", j) for j in range(9)]
     yield "noise", "", "", "level", noise[:1], None
@@ -271,6 +298,10 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
         yield "beam", "sky", "scan", f"order {s} {wave}", [("moving", wave, s, c) for c in range(4 if s else 2)], None
     if split != ALIKE:
         return
+    for on in PERIODIC if scene.timed else ():
+        keys: list[Key] = [("history", on, k) for k in range(HISTORY)]
+        for kind, mix in _histories(scene.time_lines[0].duration_s / SECONDS_PER_DAY).items():
+            yield "gain" if on else "added", on, "time", kind, keys, mix
     top = min(GAIN, scene.lmax)
     for acts_on, key in (("sky and dipole", "gain"), ("sky", "gain of the sky")):
         if key != "gain":

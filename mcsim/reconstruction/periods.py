@@ -67,6 +67,12 @@ class TimeLine:
         line = sum(visit @ one for visit, one in zip(self.visits, products, strict=True))
         return np.asarray(np.abs(rfft(line, self._padded)) ** 2)
 
+    def history(self, split: int, product: Map, parts: int) -> Vector:
+        """Return the score of a constant in each of so many equal parts of the survey's time, of one map, (parts,)."""
+        line = self.visits[split] @ product
+        starts = np.linspace(0, len(line), parts, endpoint=False).astype(int)
+        return np.asarray(np.add.reduceat(line, starts))
+
     def peak(self, on: str, products: Sequence[Map]) -> Peak:
         """Return the largest peak between FEWEST cycles in the survey and the shortest period.
 

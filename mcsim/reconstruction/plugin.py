@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mcsim.reconstruction.forms import FORMS, Form
-from mcsim.reconstruction.grammar import ALIKE, ANY, LOBE, OPPOSITE, Structure
+from mcsim.reconstruction.grammar import ALIKE, ANY, HISTORIES, LOBE, OPPOSITE, Structure
 from mcsim.reconstruction.scores import ELSEWHERE, MONTH, Scene
 from mcsim.support.arrays import Vector
 
@@ -102,7 +102,9 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
     acting: dict[str, Any]
     splits = {} if alike else {"splits": _factors(structure.split, scene.splits)}
     timed: dict[str, Any] = {"coefficients": pattern, **splits}
-    if structure.frame in ("spacecraft", "time", "Sun"):
+    if structure.kind.startswith(HISTORIES):
+        timed = {"coefficients": (1.0,), "splits": pattern}
+    elif structure.frame in ("spacecraft", "time", "Sun"):
         timed |= _wave(structure)
     match structure.stage, structure.frame:
         case "added", "sky" if structure.kind.startswith("orientation"):

@@ -36,7 +36,8 @@ MONTH = (12, 14)  #: harmonics of the year that a month is made of, from 26 to 3
 HARMONICS = 4  #: highest harmonic of spin phase, year and orientation that is said by itself
 BINS = 4  #: ranges of degrees of a profile in l, equal in log l
 ACTED_ON = ("sky and dipole", "sky", "dipole")  #: what a wave multiplies, if it is not added
-PERIODIC = ("", ACTED_ON[0])  #: what a wave multiplies whose period is not known
+PERIODIC = ("", ACTED_ON[0])  #: what a wave multiplies whose period is not known, or what steps or decays
+HISTORY = 16  #: equal parts of the survey's time, in which steps and decays are known
 ELSEWHERE = 32  #: highest degree of a signal from elsewhere: a lobe has as many orders, and what is finer averages out
 
 Key = tuple[str | int, ...]
@@ -139,6 +140,7 @@ class Scene:
             found += [(on, i, name, c) for on in ("", *ACTED_ON) for name, c in every]
             found += [("elsewhere", i, name, on) for name in view.elsewhere for on in ACTED_ON[:2]]
             found += [("moving", i, wave, s, c) for wave, s in view.moves for c in range(4 if s else 2)]
+            found += [("history", i, on, k) for on in PERIODIC for k in range(HISTORY if self.timed else 0)]
             found += [("noise", i, j) for j in range(9)]
             for s in range(min(ORDERS, len(view.w)) + 1):
                 if s <= self.split_orders or i == self.of(view.channel)[0]:
@@ -192,6 +194,8 @@ class Scene:
             found += [np.array([(r * self.dipole) @ one for one in every])]
             found += self._elsewhere(r, filtered.sky, view)
             found += [_moving(r, view, wave, bent[view.channel][s], s) for wave, s in view.moves]
+            for product in (r, r * whole) if self.timed else ():
+                found.append(self.time_lines[view.channel].history(view.split, product, HISTORY))
             found.append(0.5 * self._patterns[:9] @ divided(r**2, view.precision))
             found += list(self._orders(view, filtered.orders[i], i))
         for channel in range(len(self.channels)):

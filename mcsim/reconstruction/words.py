@@ -148,6 +148,8 @@ def _wave(kind: str) -> str:
         return "time, growing steadily"
     if wave == "month":
         return "month"
+    if wave in _IN_TIME:
+        return _IN_TIME[wave].format(harmonic)
     if wave == "period":
         seconds, name = float(harmonic), "day"
         for unit, size in (("day", 86400.0), ("hour", 3600.0), ("minute", 60.0)):
@@ -158,6 +160,15 @@ def _wave(kind: str) -> str:
     often = {ANY: ", in any way", "1": ""}.get(harmonic, f", {_TIMES.get(harmonic)} a {wave}")
     return ("year" if wave == "year" else "spin phase") + often
 
+
+_IN_TIME = {
+    "from": "time, from day {} on",
+    "until": "time, until day {}",
+    "step": "time, with a step on day {}",
+    "decay": "time, falling by e in {} days from the start on",
+    "rise": "time, rising by e in {} days until the end",
+}
+"""Functions of the survey's time, with their day or days."""
 
 _TIMES = {"2": "twice", "3": "three times", "4": "four times"}
 
