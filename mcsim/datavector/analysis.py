@@ -249,7 +249,7 @@ class Job:
     library: Kinds = field(default_factory=lambda: kinds_of(None))
     source: Source | None = None  # simulates in place of mcsim
     nuisances: bool = False  # draw those of the run
-    periods_s: tuple[float, ...] = ()  # of waves that scores are wanted of besides those of the grammar
+    chosen: tuple[str, ...] = ()  # kinds of structures that scores are wanted of besides those of the grammar
 
     @property
     def definition(self) -> tuple[str, tuple[str, ...], DiagnosisSettings, Kinds]:

@@ -184,7 +184,7 @@ def describe(
     if source is None:
         more = simulated_scores.SIMULATIONS
         lines.append(
-            f"if the verdict is unknown: {more} simulations more, once for the model and where a period is found"
+            f"if the verdict is unknown: {more} more simulations, once, and again if a period or source is found"
         )
     if count:
         lines += controls.describe(analysis, count, run.compute.workers)

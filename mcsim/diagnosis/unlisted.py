@@ -168,9 +168,8 @@ class Reconstruction:
             if structure.by_coordinate:
                 each = float(np.linalg.norm(theta)) * np.eye(structure.size)
             shape, share = structure, None
-            if (
-                structure.stage in ("beam", "elsewhere", "noise") and structure.split != ALIKE
-            ):  # that of all, in some maps
+            own = structure.stage in ("beam", "elsewhere", "noise") or structure.kind.startswith("source")
+            if own and structure.split != ALIKE:  # that of all, in some maps
                 shape, share = replace(structure, split=ALIKE), np.zeros(len(self.scene.views))
                 share[list(structure.views)] = structure.weights
             effects = [plugin("unlisted", shape, one, self.scene) for one in each]

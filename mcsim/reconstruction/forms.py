@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan.model import SECONDS_PER_DAY
+from mcsim.reconstruction.sources import at, points
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
 from mcsim.sphere.sky import dipole_alm
@@ -73,6 +74,23 @@ class AddedPattern(Form):
         if self.index:
             factor *= (site.frequency(self.name) / REFERENCE_GHZ) ** self.index
         return sky + factor * real.to_alm(np.array(self.coefficients), site.lmax)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompactSource(Form):
+    """A compact source is added, of a flux in uK sr at 94 GHz, times (frequency / 94 GHz)^``index``."""
+
+    lon_deg: ClassVar[float]
+    lat_deg: ClassVar[float]
+    factor: ClassVar[float]
+    index: ClassVar[float] = 0.0
+
+    def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
+        self.check_frame(site)
+        factor = self.amplitude * self.factor
+        if self.index:
+            factor *= (site.frequency(self.name) / REFERENCE_GHZ) ** self.index
+        return sky + factor * at((self.lon_deg, self.lat_deg), site.lmax)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -293,10 +311,7 @@ class Elsewhere(Form):
         """Add Y*_lm of the directions, as of a beam that points there."""
         top = min(self.top, beam.lmax)
         *vector, weight = np.array(self.towards).T
-        angles = np.reshape(healpy.vec2dir(*vector), (2, -1)).T
-        lobe = ducc0.sht.adjoint_synthesis_general(
-            map=weight[None], loc=angles, spin=0, lmax=top, epsilon=1e-10, nthreads=1
-        )[0]
+        lobe = points(np.array(vector), weight, top)
         kernel = site.beam.blm[0, : top + 1].real * np.sqrt(4.0 * np.pi / (2.0 * np.arange(top + 1) + 1.0))
         kernel[: 0 if self.on_dipole else 2] = 0.0
         blm = np.zeros((max(beam.mmax, top) + 1, beam.lmax + 1), dtype=np.complex128)
@@ -398,8 +413,8 @@ def _maps_of(coefficients: tuple[float, ...], spins: tuple[int, ...]) -> list[ND
 FORMS: dict[str, type[Form]] = {
     kind.__name__: kind
     for kind in (
-        AddedPattern, GainPattern, RotatedSky, BoostedSky, SignalPower, SkyPower, BeamOrder, AddedToSamples,
-        GainOverTime, GainOfOne, Elsewhere, NoisePattern,
+        AddedPattern, CompactSource, GainPattern, RotatedSky, BoostedSky, SignalPower, SkyPower, BeamOrder,
+        AddedToSamples, GainOverTime, GainOfOne, Elsewhere, NoisePattern,
     )
 }  # fmt: skip
 """The forms by the name of their class."""

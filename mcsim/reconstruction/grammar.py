@@ -31,7 +31,7 @@ from mcsim.reconstruction.scores import (
     View,
 )
 from mcsim.sphere import real
-from mcsim.sphere.rotation import rotation_matrix
+from mcsim.sphere.rotation import FRAMES, rotation_matrix
 from mcsim.support.arrays import Matrix, Vector
 
 ALIKE, OPPOSITE = "alike", "opposite"
@@ -154,7 +154,7 @@ class Structure:
 def _briefly(kind: str) -> list[str]:
     if kind.startswith(HISTORIES):
         return [HISTORIES[0]]
-    return kind.split()[: 1 if kind.startswith(("degrees", "crossing")) else 2]
+    return kind.split()[: 1 if kind.startswith(("degrees", "crossing", "source")) else 2]
 
 
 def _crossing(phase: float, narrow: float) -> Matrix:
@@ -184,7 +184,7 @@ DECAYS = (1 / 16, 1 / 8, 1 / 4)  #: times in which a decay has fallen by e, as f
 
 def _histories(days: float) -> dict[str, Matrix]:
     """Return the values of functions of a survey's time in its equal parts, shape (1 or 2, HISTORY), by their kind."""
-    found, part = {}, np.arange(HISTORY)
+    found, part = dict[str, Matrix](), np.arange(HISTORY)
     for first in range(1, HISTORY):
         after, day = (part >= first).astype(float), f"{days * first / HISTORY:.4g}"
         found |= {f"from {day}": after[None], f"until {day}": 1.0 - after[None]}
@@ -251,6 +251,8 @@ def _tried(scene: Scene, kind: str) -> float:
         return scene.time_lines[0].tried
     if kind.startswith(HISTORIES):
         return float(3 * (HISTORY - 1) + 2 * len(DECAYS))
+    if kind.startswith("source"):
+        return scene.places
     return float(len(_CROSSINGS)) if kind.startswith("crossing") else 1.0
 
 
@@ -349,6 +351,8 @@ def _timed(scene: Scene, view: View, on: str) -> Iterator[_Form]:
 
 def _added(scene: Scene) -> Iterator[_Form]:
     """Yield patterns on the sky that are added: of few degrees, and zonal ones."""
+    for kind in scene.views[0].sources:
+        yield "added", "", "sky", kind, [("source", kind)], None
     for degree, kind in enumerate(("monopole", "dipole", "quadrupole")):
         yield "added", "", "sky", kind, [("added", j) for j in range(degree**2, (degree + 1) ** 2)], None
     for degree in sorted({min(top, scene.degree) for top in (1, 2, 4, scene.degree)}):
@@ -383,7 +387,7 @@ def _galaxy(frame: str) -> Matrix:
 
 def _latitudes(frame: str, top: int) -> list[tuple[str, Matrix]]:
     """Return the real coefficients of patterns of one latitude alone, by what they are called."""
-    poles = {name: rotation_matrix(frame, name)[2] for name in ("ecliptic", "galactic")}
+    poles = {name: rotation_matrix(frame, name)[2] for name in FRAMES}
     zonal = {f"latitude {name}": real.zonal(pole, top) for name, pole in poles.items()}
     return [*((f"{name} 0-2", each[:3]) for name, each in zonal.items() if top > 2), *zonal.items()]
 

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.fft import next_fast_len, rfft
 from scipy.sparse import csr_matrix
 
+from mcsim.reconstruction.choices import Choice
 from mcsim.support.arrays import Map, Vector
 
 SHORTEST_S = 900.0  #: period; the phases of a spin, which are faster, have words of their own
@@ -19,14 +20,6 @@ FEWEST = 5  #: cycles in the survey; slower waves have words of their own
 SPANS = 3  #: spans of time of the shortest period, at least
 PADDING = 2  #: frequencies of the periodogram for each independent one, at least
 DRAWS = 200  #: of white noise, from which the variance at every frequency is known to 7 %
-
-
-@dataclass(frozen=True)
-class Peak:
-    """The largest peak of a periodogram."""
-
-    period_s: float
-    fall: float  #: of chi^2: twice the power over its mean in noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +66,10 @@ class TimeLine:
         starts = np.linspace(0, len(line), parts, endpoint=False).astype(int)
         return np.asarray(np.add.reduceat(line, starts))
 
-    def peak(self, on: str, products: Sequence[Map]) -> Peak:
-        """Return the largest peak between FEWEST cycles in the survey and the shortest period.
+    def peak(self, on: str, products: Sequence[Map]) -> Choice:
+        """Return the period of the largest peak between FEWEST cycles in the survey and the shortest period.
 
+        The fall of chi^2 is twice the power over its mean in noise.
         Its place between frequencies is the top of a parabola through the logarithm of three of them.
         """
         step = 1.0 / (self._padded * self.span_s)
@@ -87,4 +81,4 @@ class TimeLine:
         curved = before - 2.0 * here + after
         between = 0.5 * (before - after) / curved if curved < 0.0 else 0.0
         place = best + float(np.clip(between, -0.5, 0.5))
-        return Peak(1.0 / (step * place), float(2.0 * ratio[best - first]))
+        return Choice(f"period {float(1.0 / (step * place))!r}", float(2.0 * ratio[best - first]))

@@ -77,8 +77,8 @@ def _literal(value: Any) -> str:
 def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plugin | None:
     """Return the effect of a structure with fitted coordinates; None if no effect of the simulator can be like it.
 
-    These are powers of unknown patterns, beams that follow a wave, beams, signals from elsewhere and noise that differ
-    between splits, and what depends on time or orientation where the pointing is not known.
+    These are powers of unknown patterns, beams that follow a wave, beams, compact sources, signals from elsewhere and
+    noise that differ between splits, and what depends on time or orientation where the pointing is not known.
     """
     made = _form(structure, theta, scene)
     if made is None:
@@ -89,7 +89,7 @@ def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plug
     common = structure.channel is None and len(scene.channels) > 1
     scope = {"scope": "common"} if common or base == "SkyPower" else {}
     on_sky = (
-        base in ("AddedPattern", "GainPattern", "RotatedSky", "BoostedSky", "NoisePattern")
+        base in ("AddedPattern", "CompactSource", "GainPattern", "RotatedSky", "BoostedSky", "NoisePattern")
         or values.get("wave") == "sky"
     )
     frame = {"frame": scene.frame} if on_sky else {}
@@ -109,6 +109,10 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
     match structure.stage, structure.frame:
         case "added", "sky" if structure.kind.startswith("orientation"):
             return "AddedToSamples", {"wave": "sky", "spins": (int(structure.kind.split()[1]),), **timed}
+        case "added", "sky" if structure.kind.startswith("source"):
+            lon_deg, lat_deg = map(float, structure.kind.split()[1:])
+            place = {"lon_deg": lon_deg, "lat_deg": lat_deg, "index": structure.index or 0.0}
+            return ("CompactSource", {"factor": float(theta[0]), **place}) if alike else None
         case "added", "sky" if structure.kind != "power":
             if alike:
                 return "AddedPattern", {"coefficients": pattern, "index": structure.index or 0.0}

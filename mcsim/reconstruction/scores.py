@@ -17,8 +17,10 @@ from scipy.sparse import csr_matrix
 from scipy.special import poch
 
 from mcsim.datavector.wiener_filter import FilteredMaps
+from mcsim.reconstruction import sources
+from mcsim.reconstruction.choices import Choice
 from mcsim.reconstruction.forms import boosts, rotations
-from mcsim.reconstruction.periods import Peak, TimeLine
+from mcsim.reconstruction.periods import TimeLine
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
 from mcsim.sphere.sky import dipole_alm
@@ -57,6 +59,7 @@ class View:
     moving: Mapping[tuple[str, int], NDArray[np.complex128]]
     #: means over the samples of every coarse pixel of what they see elsewhere, shape (pixels, pixels), by name
     elsewhere: Mapping[str, csr_matrix]
+    sources: Mapping[str, Map]  #: what compact sources of unit flux add, by their kind in the grammar
     precision: Map  #: one over the variance of the noise
     response: Cl  #: B_l w_l of the channel, shape (lmax + 1,)
     kernel: Cl  #: b_l0 of its beam, shape (lmax + 1,)
@@ -139,6 +142,7 @@ class Scene:
             every = [(name, c) for name, maps in view.waves.items() for c in range(len(maps))]
             found += [(on, i, name, c) for on in ("", *ACTED_ON) for name, c in every]
             found += [("elsewhere", i, name, on) for name in view.elsewhere for on in ACTED_ON[:2]]
+            found += [("source", i, kind) for kind in view.sources]
             found += [("moving", i, wave, s, c) for wave, s in view.moves for c in range(4 if s else 2)]
             found += [("history", i, on, k) for on in PERIODIC for k in range(HISTORY if self.timed else 0)]
             found += [("noise", i, j) for j in range(9)]
@@ -164,12 +168,38 @@ class Scene:
         n = healpy.pix2vec(self.nside, np.arange(12 * self.nside**2))
         return np.stack([real.field(unit, *n) for unit in np.eye((GAIN + 1) ** 2)])
 
-    def peaks(self, filtered: FilteredMaps) -> dict[tuple[int, str], Peak]:
-        """Return the largest peak in the residuals of every channel, by it and by what the wave acts on."""
+    @cached_property
+    def continua(self) -> list[tuple[int, float]]:
+        """Return of each of :meth:`peaks` its coordinates, and among how many independent ones it is chosen."""
+        periods = [(2, line.tried) for line in self.time_lines for _ in PERIODIC]
+        return periods + [(1, self.places) for _ in self._groups]
+
+    @property
+    def places(self) -> float:
+        """Return the number of independent places of a compact source."""
+        return (self.lmax + 1.0) ** 2
+
+    @property
+    def _groups(self) -> list[tuple[int, ...]]:
+        """Return the maps in which a source is looked for together: those of a channel, and each by itself."""
+        channels = [self.of(c) for c in range(len(self.channels))]
+        return [*channels, *((i,) for own in channels if len(own) > 1 for i in own)]
+
+    def peaks(self, filtered: FilteredMaps) -> list[Choice]:
+        """Return what stands out most of every continuum: periods of a channel, added and of its gain, and sources."""
         residual, whole = filtered.residual, filtered.expected + self.dipole
         products = dict(zip(PERIODIC, (residual, residual * whole), strict=True))
         each = ((c, on) for c in range(len(self.time_lines)) for on in PERIODIC)
-        return {(c, on): self.time_lines[c].peak(on, [products[on][i] for i in self.of(c)]) for c, on in each}
+        found = [self.time_lines[c].peak(on, [products[on][i] for i in self.of(c)]) for c, on in each]
+        seen = (alm_.multiply(one, v.response, self.lmax) for one, v in zip(filtered.adjoint, self.views, strict=True))
+        maps = [healpix.synthesis(one[None], self.nside, self.lmax)[0] for one in seen]
+        spots = ([[each[i] for i in group] for each in (maps, self._spreads)] for group in self._groups)
+        return found + [sources.brightest(*one) for one in spots]
+
+    @cached_property
+    def _spreads(self) -> list[Map]:
+        """Return the variance of the score of a source in every pixel of every map."""
+        return [sources.variance(view.precision, view.response, self.nside, self.lmax) for view in self.views]
 
     def values(self, filtered: FilteredMaps) -> Vector:
         """Return the scores, shape (len(keys),)."""
@@ -193,6 +223,7 @@ class Scene:
             found += [np.array([(r * sky - lost) @ one for one in every])]
             found += [np.array([(r * self.dipole) @ one for one in every])]
             found += self._elsewhere(r, filtered.sky, view)
+            found.append(np.array([r @ one for one in view.sources.values()]))
             found += [_moving(r, view, wave, bent[view.channel][s], s) for wave, s in view.moves]
             for product in (r, r * whole) if self.timed else ():
                 found.append(self.time_lines[view.channel].history(view.split, product, HISTORY))

@@ -20,6 +20,8 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import FilteredMaps, Model, sky_variance, wiener_filter
 from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel
 from mcsim.instrument.scan.model import SECONDS_PER_DAY
+from mcsim.reconstruction import sources
+from mcsim.reconstruction.choices import Choice, angle_apart, frequency_apart
 from mcsim.reconstruction.forms import AddedToSamples
 from mcsim.reconstruction.grammar import structures
 from mcsim.reconstruction.periods import SHORTEST_S, SPANS, TimeLine
@@ -38,6 +40,8 @@ from mcsim.reconstruction.scores import (
 from mcsim.reconstruction.search import LEVEL, Search, evidence
 from mcsim.simulation.pixel_means import signal_of
 from mcsim.simulation.tod import samples
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
 from mcsim.support import folders
 from mcsim.support.arrays import Map, Matrix, Vector, divided
 from mcsim.support.code import package_digest
@@ -46,7 +50,7 @@ from mcsim.systematics.spacecraft import axes, spin_phase
 
 SIMULATIONS = 400
 """Of the model, for mean and covariance of the scores: as many realizations more, once for each model, and once for
-each period that is found."""
+all choices of one data set."""
 
 SEED = 0x6D63 * 1_000 + 4  #: of these simulations; those of the data vector and of the controls have others
 
@@ -69,7 +73,7 @@ VISITS = 2_000_000  #: of a map, about, by which it is known when each pixel is 
 
 CODE = (
     *("config", "sphere", "instrument", "systematics", "simulation"),
-    *(f"reconstruction.{name}" for name in ("forms", "periods", "scores", "simulated_scores")),
+    *(f"reconstruction.{name}" for name in ("choices", "forms", "periods", "scores", "simulated_scores", "sources")),
     *(f"datavector.{name}" for name in ("analysis", "matched_filters", "wiener_filter")),
 )
 """What scores of simulations are computed with."""
@@ -98,7 +102,7 @@ def scene_of(model: Model) -> Scene:
         seen = _elsewhere(channel.site.pointed("elsewhere"), grid, elsewhere[part.channel]) if timed else {}
         response = model.response[part.channel]
         moving = _moving(channel.site.pointed("a beam"), grid) if timed else {}
-        views.append(View(part.channel, split, moments, waves, moving, seen, part.precision, response, kernel))
+        views.append(View(part.channel, split, moments, waves, moving, seen, {}, part.precision, response, kernel))
     return Scene(
         channels=model.channels,
         frequencies=tuple(channel.site.frequency_ghz for channel in model.survey.channels),
@@ -116,12 +120,18 @@ def scene_of(model: Model) -> Scene:
     )
 
 
-def with_periods(model: Model, scene: Scene, periods_s: Sequence[float]) -> Scene:
-    """Return a scene that has waves of these periods besides."""
-    views = []
+def with_chosen(model: Model, scene: Scene, kinds: Sequence[str]) -> Scene:
+    """Return a scene that has waves of periods, or compact sources, besides: kinds of structures."""
+    views, chosen = [], [Choice(kind, 0.0) for kind in kinds]
     for i, view in enumerate(scene.views):
-        more = {f"period {one!r}": _waves(model, i, {"wave": "period", "period_s": one}) for one in periods_s}
-        views.append(replace(view, waves={**view.waves, **more}))
+        waves, spots = dict(view.waves), dict(view.sources)
+        for one in chosen:
+            if one.family == "period":
+                waves[one.kind] = _waves(model, i, {"wave": "period", "period_s": one.numbers[0]})
+            else:
+                seen = alm_.multiply(sources.at(one.numbers, model.lmax), view.response, model.lmax)
+                spots[one.kind] = healpix.synthesis(seen[None], model.nside, model.lmax)[0]
+        views.append(replace(view, waves=waves, sources=spots))
     return replace(scene, views=tuple(views))
 
 
@@ -230,20 +240,20 @@ def scores_of_maps(model: Model, scene: Scene, maps: Sequence[Map]) -> Vector:
 def scores(job: Job) -> Matrix:
     """Return the scores of the simulations of a job, shape (count, P): the task that a worker runs.
 
-    Behind them stand the falls of chi^2 of peaks, if the job names no periods.
+    Behind them stand the falls of chi^2 of peaks, if the job names no kinds.
     """
     model, scene = analysis_for(job).model, scene_for(job)
     filtered = (wiener_filter(model, maps) for maps in simulated_maps(job))
-    return np.stack([np.append(scene.values(one), [] if job.periods_s else _falls(scene, one)) for one in filtered])
+    return np.stack([np.append(scene.values(one), [] if job.chosen else _falls(scene, one)) for one in filtered])
 
 
 def _falls(scene: Scene, filtered: FilteredMaps) -> list[float]:
-    return [one.fall for one in scene.peaks(filtered).values()]
+    return [one.fall for one in scene.peaks(filtered)]
 
 
 def scene_for(job: Job) -> Scene:
-    """Return the scene of the model of a job, with waves of its periods; the last one of a model is kept."""
-    return with_periods(analysis_for(job).model, _scene(*job.definition), job.periods_s)
+    """Return the scene of the model of a job, with the kinds that it names; the last one of a model is kept."""
+    return with_chosen(analysis_for(job).model, _scene(*job.definition), job.chosen)
 
 
 @lru_cache(maxsize=1)
@@ -259,38 +269,49 @@ def search_of(analysis: Analysis, scene: Scene, ask: Ask) -> Search:
 
 
 def _charged(scene: Scene, falls: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the evidences of peaks from their falls of chi^2, shape (..., peaks), all frequencies charged."""
-    return evidence(falls, 2) - np.log([line.tried for line in scene.time_lines for _ in PERIODIC])
+    """Return the evidences of peaks from their falls of chi^2, shape (..., peaks), all of each continuum charged."""
+    sizes, tried = np.transpose(scene.continua)
+    return evidence(falls, sizes) - np.log(tried)
 
 
 def with_peaks(analysis: Analysis, scene: Scene, search: Search, maps: Sequence[Map], ask: Ask) -> tuple[Scene, Search]:
-    """Return scene and search with the periods that are significant by themselves, the most evident first, if any.
+    """Return scene and search with the choices that are significant by themselves, the most evident first, if any.
 
-    Periods are the same if they are so over the survey within half a cycle.
+    Periods are the same if they are so over the survey within half a cycle, and sources if a beam hardly tells them.
     """
-    found = list(scene.peaks(wiener_filter(analysis.model, maps)).values())
-    evidences, periods = _charged(scene, np.array([one.fall for one in found])), [one.period_s for one in found]
-    chosen = list[float]()
+    found = scene.peaks(wiener_filter(analysis.model, maps))
+    evidences = _charged(scene, np.array([one.fall for one in found]))
+    chosen = list[Choice]()
     for k in np.argsort(-evidences):
-        apart = [abs(1.0 / periods[k] - 1.0 / one) * scene.time_lines[0].duration_s for one in chosen]
-        if search.pvalue(evidences[k]) <= LEVEL and min(apart, default=np.inf) > 0.5:
-            chosen.append(periods[k])
+        new = not any(_same(scene, found[k], one) for one in chosen)
+        if new and search.pvalue(evidences[k]) <= LEVEL:
+            chosen.append(found[k])
     if not chosen:
         return scene, search
-    more = with_periods(analysis.model, scene, chosen)
-    return more, Search(structures(more), null_scores(analysis, ask, tuple(chosen)), search.peaks)
+    kinds = tuple(one.kind for one in chosen)
+    more = with_chosen(analysis.model, scene, kinds)
+    return more, Search(structures(more), null_scores(analysis, ask, kinds), search.peaks)
 
 
-def null_scores(analysis: Analysis, ask: Ask, periods_s: tuple[float, ...] = ()) -> Matrix:
+def _same(scene: Scene, one: Choice, other: Choice) -> bool:
+    """Return True for two choices that are one."""
+    if one.family != other.family:
+        return False
+    if one.family == "period":
+        return frequency_apart(one, other) * scene.time_lines[0].duration_s <= 0.5
+    return angle_apart(one, other) * scene.lmax <= np.pi
+
+
+def null_scores(analysis: Analysis, ask: Ask, chosen: tuple[str, ...] = ()) -> Matrix:
     """Return :func:`scores` of SIMULATIONS simulations of the model, simulated or from the cache."""
     run = analysis.run
     science = config.science(run, *(("nuisance",) if run.nuisances else ()))
-    identity = [science | {"ensemble": {}}, SIMULATIONS, periods_s, package_digest(f"mcsim.{name}" for name in CODE)]
+    identity = [science | {"ensemble": {}}, SIMULATIONS, chosen, package_digest(f"mcsim.{name}" for name in CODE)]
     identity.append(asdict(replace(analysis.settings, without=(), including=())))
     key = hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
     def fill(folder: Path) -> None:
-        job = replace(analysis.job(seeded(run, SEED)), nuisances=bool(run.nuisances), periods_s=periods_s)
+        job = replace(analysis.job(seeded(run, SEED)), nuisances=bool(run.nuisances), chosen=chosen)
         starts = range(0, SIMULATIONS, PER_TASK)
         jobs = [replace(job, first=k, count=min(PER_TASK, SIMULATIONS - k)) for k in starts]
         np.save(folder / "scores.npy", np.concatenate(ask(jobs)))

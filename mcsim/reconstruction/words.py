@@ -59,6 +59,9 @@ def _what(structure: Structure, theta: Vector) -> str:
             _, order, degrees = kind.split(maxsplit=2)
             turns = f"turns with the beam (order {order}, {_pattern(degrees)})"
             return f"is added to the signal, fixed to the sky, and {turns}"
+        case "added", "sky" if kind.startswith("source"):
+            lon_deg, lat_deg = map(float, kind.split()[1:])
+            return f"is a compact source, at longitude {lon_deg:.0f}° and latitude {lat_deg:.0f}°".replace("-", "−")
         case "added", "sky":
             return f"is added to the signal, fixed to the sky ({_pattern(kind)})"
         case "added", "spacecraft" if kind == "lobe":

@@ -55,8 +55,8 @@ def test_a_wave_is_the_peak(line, period_s):
     for k in range(10):
         noise = np.sqrt(NOISE) * np.random.default_rng(10 + k).normal(size=PIXELS)
         peak = line.peak("", [NOISE * size * mean + noise])
-        assert abs(1.0 / peak.period_s - 1.0 / period_s) < 0.25 / line.duration_s
-        assert repr(peak.period_s) == str(peak.period_s)  # it is a part of the structure's kind, which is read again
+        assert abs(1.0 / peak.numbers[0] - 1.0 / period_s) < 0.25 / line.duration_s
+        assert peak.kind == f"period {peak.numbers[0]!r}"  # it is a part of the structure's kind, which is read again
         falls.append(peak.fall)
     # At best snr^2 + 2; between two frequencies (2 / pi)^2 of it is lost with as many as are independent, 0.19 here.
     error = 2.0 * snr / np.sqrt(10) + snr**2 * np.sqrt(1.0 / DRAWS) * 2.0
