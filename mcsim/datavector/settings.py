@@ -64,6 +64,8 @@ class DiagnosisSettings:
         P-value of chi^2 above which maps in another order are said to fit the model.
     reduction_sigma
         Standard deviations by which a fractional reduction on held-out data may miss its prediction, or zero.
+    unexplained_pvalue
+        P-value up to which what remains of held-out data contradicts effects that leave more than half of their excess.
     half_snr_share
         Share of an effect's expected S/N that each half needs for a reduction to be measured.
     consistency_level
@@ -184,6 +186,7 @@ class DiagnosisSettings:
     partial_refusals: int = 6
     exchanged_pvalue: float = 0.01
     reduction_sigma: float = 3.0
+    unexplained_pvalue: float = 1e-3
     half_snr_share: float = 0.2
     consistency_level: float = 0.01
     absence_odds: float = 20.0

@@ -59,13 +59,13 @@ def confirmed(
 ) -> tuple[Attribution, HeldOut | None]:
     """Return attribution and reduction if they hold once the best set is simulated.
 
-    A set that increases the excess chi^2 of the held-out data, or reduces it by less than half of the prediction, both
-    beyond error, is not named. Held-out data without excess beyond its own error measure no reduction. ``notes`` gets
-    a sentence on either.
+    A set that increases the excess chi^2 of the held-out data, reduces it by less than half of the prediction, or
+    leaves most of it where what remains is significant, all beyond error, is not named. Held-out data without excess
+    beyond its own error measure no reduction. ``notes`` gets a sentence on either.
     """
     if reduction is None:
         return found, None
-    if reduction.refutes(context.settings.reduction_sigma):
+    if reduction.refutes(context.settings.reduction_sigma, context.settings.unexplained_pvalue):
         best = " and ".join(context.candidates[member].title for member in found.explanations[0].members)
         notes.append(f"The best fit, {best}, is not named: {refuted(reduction)}.")
         return found.unexplained(), None

@@ -38,7 +38,8 @@ def reconstructed(result: DiagnosisResult, data: ObservedMaps, ask: Ask) -> Diag
     analysis = data.context.analysis
     scene = scene_for(analysis.job(analysis.run))
     found, reduction = structures_of(data, scene, search_of(analysis, scene, ask), ask)
-    if reduction is not None and reduction.refutes(analysis.settings.reduction_sigma):
+    settings = analysis.settings
+    if reduction is not None and reduction.refutes(settings.reduction_sigma, settings.unexplained_pvalue):
         what = " and ".join(one.says for one in found)
         note = f"What {what} fits best, and is not what is missing: {refuted(reduction)}."
         return replace(result, unlisted=(), notes=(*result.notes, note))

@@ -33,12 +33,16 @@ class HeldOut:
     pvalue_after: float
     data: str
 
-    def refutes(self, sigma: float) -> bool:
-        """Return True if the excess grows, or falls by less than half of the prediction, both beyond errors.
+    def refutes(self, sigma: float, level: float) -> bool:
+        """Return True if the effects are not what is missing, beyond ``sigma`` standard deviations.
 
-        ``sigma`` is the number of standard deviations.
+        The excess grows, or falls by less than half of the prediction, or by less than half where what remains has a
+        p-value up to ``level``. The last needs no prediction: a half of the data that asks for no effect predicts that
+        nothing is removed.
         """
         before, fraction, expected = self.before.value, self.achieved, self.predicted
+        if self.pvalue_after <= level and fraction.value + sigma * fraction.sigma < 0.5:
+            return True
         grows = fraction.value * before + sigma * fraction.sigma * abs(before) < 0.0
         short = expected.value - fraction.value > sigma * np.hypot(expected.sigma, fraction.sigma)
         return bool(grows or (short and before > 0.0 and fraction.value < 0.5 * min(expected.value, 1.0)))

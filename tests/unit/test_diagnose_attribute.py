@@ -418,6 +418,26 @@ def test_set_that_closes_less_than_half_of_what_was_forecast_is_not_named(bench,
     assert named or ("180" if achieved < 0.0 else "35 %") in notes[0]
 
 
+@pytest.mark.parametrize(
+    ("achieved", "pvalue", "named"),
+    [
+        (-0.06, 1.4e-6, False),  # nothing was predicted, nothing is removed, and what remains is no chance
+        (-0.06, 0.01, True),
+        (0.35, 1e-5, True),  # half is within three standard deviations
+    ],
+)
+def test_set_that_leaves_a_significant_half_is_not_named(bench, achieved, pvalue, named):
+    """A half that asks for no effect predicts no reduction; the other half then decides."""
+    found = bench.diagnose_maps(12.0 * bench.t[:, 3], 0)
+    context = SimpleNamespace(candidates=bench.candidates, settings=DiagnosisSettings())
+    before, after = Measured(100.0, 20.0), Measured(100.0 * (1.0 - achieved), 20.0)
+    shrink = HeldOut(Measured(-0.08, 0.06), Measured(achieved, 0.066), before, after, pvalue, "half2")
+    notes: list[str] = []
+    judged, _ = confirmed(context, found, shrink, notes)
+    assert judged.verdict == ("effect" if named else "unknown")
+    assert named or "what remains differs from the simulations" in notes[0]
+
+
 @pytest.mark.parametrize("before", [1.0, -1.0])
 @pytest.mark.parametrize(("after", "named"), [(15.0, True), (80.0, False)])
 def test_half_without_a_gap_measures_no_shrink(bench, before, after, named):
