@@ -24,7 +24,7 @@ MOST = 3  #: largest number of structures
 SECOND = 0.1
 """Least fall of chi^2 of a further structure over that of the first: below it may be the square of the first."""
 
-FINALISTS, NEAR, SPARE = 14, 5.0, 2
+FINALISTS, NEAR, SPARE = 20, 5.0, 2
 """Structures that are compared by their responses on the sky of the data: how many at most, within which difference of
 the evidence those of one stage and frame, and simulations for each of their scores."""
 
