@@ -178,6 +178,18 @@ class InverseCovariance:
             )
         return alm_.multiply(_unpacked(found, self.lmax), scale, self.lmax)
 
+    def approach(self, sky: Alm, tolerance: float, iterations: int) -> Alm:
+        """Return the same as :meth:`solve` to a tolerance, or as near as so many iterations come.
+
+        What is left of the system is compared with S^-1/2 s^, which is what remains of the sky in C^-1 d: where the sky
+        is far above the noise that is much less than the right hand side.
+        """
+        known = _packed(alm_.multiply(sky, self._root, self.lmax), self.lmax)
+        modes, gain = 2.0 * np.arange(self.lmax + 1) + 1.0, self._gain
+        expected = float(np.sqrt(modes @ (gain / (1.0 + gain)) / (modes @ (gain * (1.0 + gain)))))
+        found, _ = conjugate_gradients(self._normal, known, self._precondition, (tolerance * expected, iterations))
+        return alm_.multiply(_unpacked(found, self.lmax), self._root, self.lmax)
+
     def iterations(self, sky: Alm) -> int:
         """Return how many iterations :meth:`solve` takes."""
         known = _packed(alm_.multiply(sky, self._root, self.lmax), self.lmax)

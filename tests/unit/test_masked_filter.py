@@ -1,0 +1,82 @@
+"""Maps that lack a part of the sky are filtered by their inverse covariance."""
+
+from dataclasses import replace
+
+import healpy
+import numpy as np
+import pytest
+
+from instruments import two_channels
+from mcsim import config
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.wiener_filter import model_of, shared_sky, wiener_filter
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+from mcsim.sphere import alm as alm_
+
+NSIDE, LMAX = 16, 32
+CUT = 0.3  #: sine of the latitude up to which the equator is hidden
+HEIGHT = healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[2]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    path = tmp_path_factory.mktemp("mask") / "mask.fits"
+    healpy.write_map(path, (np.abs(HEIGHT) > CUT).astype(float), dtype=np.float64)
+    table = two_channels("masked", lmax=LMAX, nside=NSIDE, fwhm_arcmin=500.0, sigma0_uk=200.0, period_s=311.0)
+    table["map"] |= {"mask": str(path), "mask_frame": "ecliptic"}
+    return config.load(table)
+
+
+def modelled(run, **settings):
+    return model_of(survey(run, orders=2), DiagnosisSettings(beam_orders=2, **settings))
+
+
+def unbalanced(model, maps):
+    """Return S^1/2 (sum_i P_i^t r_i) - S^-1/2 s^, relative to the second: zero for the inverse covariance."""
+    filtered = wiener_filter(model, maps)
+    each = zip(filtered.adjoint, model.parts, strict=True)
+    left = sum(alm_.multiply(a, model.response[p.channel], LMAX) for a, p in each)
+    white = alm_.multiply(filtered.sky, np.sqrt(model.inverse_cl), LMAX)
+    return np.linalg.norm(alm_.multiply(left, np.sqrt(model.cl), LMAX) - white) / np.linalg.norm(white)
+
+
+def test_the_residuals_of_masked_maps_are_those_of_the_inverse_covariance(run):
+    """C^-1 d = N^-1 (d - P s^) with s^ = S P^t C^-1 d up to the tolerance, 1; samples off the centres add 0.45."""
+    model, maps = modelled(run), list(simulate.maps(survey(run), 3))
+    assert model.inverse is not None
+    assert unbalanced(model, maps) < 1.3
+    assert unbalanced(modelled(run, filter_tolerance=0.01), maps) < 0.6
+    assert unbalanced(replace(model, inverse=None), maps) > 4.0
+
+
+def test_the_sky_of_masked_maps_is_that_of_the_exact_filter(run):
+    """Most of what is left at the tolerance of simulations is behind the mask."""
+    model, maps = modelled(run), np.array(list(simulate.maps(survey(run), 4)))
+    exact = model.inverse.wiener(maps)
+    for found, tolerance in ((wiener_filter(model, list(maps)).sky, 0.3), (shared_sky(model, list(maps)), 0.01)):
+        assert np.linalg.norm(found - exact) < tolerance * np.linalg.norm(exact)
+    isotropic = shared_sky(replace(model, inverse=None), list(maps))
+    assert np.linalg.norm(isotropic - exact) > 0.4 * np.linalg.norm(exact)
+
+
+def test_the_score_of_a_signal_has_the_variance_of_its_response(run):
+    """The score t'C^-1 d of a signal t has the variance t'C^-1 t, which is its response, and no filter has less."""
+    model, plain = modelled(run, filter_tolerance=0.01), survey(run)
+    skies, excess = [list(simulate.maps(plain, k)) for k in range(100)], []
+    for one in (model, replace(model, inverse=None)):
+        scores = [wiener_filter(one, maps).residual[:2].sum(axis=0) @ HEIGHT for maps in skies]
+        changed = [m + HEIGHT if i < 2 else m for i, m in enumerate(skies[0])]  # in one channel of two
+        response = wiener_filter(one, changed).residual[:2].sum(axis=0) @ HEIGHT - scores[0]
+        excess.append(np.var(scores, ddof=1) / response)
+    assert abs(excess[0] - 1.0) < 4.0 * np.sqrt(2.0 / 99)
+    assert excess[1] > 1.2 * excess[0]
+
+
+def test_maps_that_keep_the_isotropic_filter(run):
+    assert modelled(replace(run, map=replace(run.map, mask=None, mask_frame=None))).inverse is None  # the full sky
+    assert modelled(run, hidden_share=0.5).inverse is None  # less than that is hidden
+    whole = modelled(replace(run, map=replace(run.map, mask=None, mask_frame=None)), hidden_share=0.0)
+    assert whole.inverse is not None
+    quiet = tuple(replace(one, noise=replace(one.noise, sigma0_uk=1.0)) for one in run.channels)
+    assert modelled(replace(run, channels=quiet)).inverse is None  # the sky is far above the noise at the last degree
