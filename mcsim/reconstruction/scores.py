@@ -5,8 +5,8 @@ the derivative of the log-likelihood in its amplitude. Structures that act on th
 sky. Scores of variances and powers are such derivatives too.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -97,6 +97,8 @@ class Scene:
     #: is there, if it is known when and how every sample was pointed, and splits are spans of time; else none
     elsewhere: tuple[Mapping[str, Matrix], ...]
     time_lines: tuple[TimeLine, ...]  #: of every channel, if the pointing of every sample is known; else none
+    #: variance of the score of a source in every pixel, of the maps in which it is looked for together
+    spreads: tuple[Map, ...] = ()
 
     @property
     def timed(self) -> bool:
@@ -191,15 +193,24 @@ class Scene:
         products = dict(zip(PERIODIC, (residual, residual * whole), strict=True))
         each = ((c, on) for c in range(len(self.time_lines)) for on in PERIODIC)
         found = [self.time_lines[c].peak(on, [products[on][i] for i in self.of(c)]) for c, on in each]
+        return found + list(map(sources.brightest, self.bright(filtered), self.spreads))
+
+    def bright(self, filtered: FilteredMaps) -> list[Map]:
+        """Return the score of a source in every pixel, in the maps in which it is looked for together."""
         seen = (alm_.multiply(one, v.response, self.lmax) for one, v in zip(filtered.adjoint, self.views, strict=True))
         maps = [healpix.synthesis(one[None], self.nside, self.lmax)[0] for one in seen]
-        spots = ([[each[i] for i in group] for each in (maps, self._spreads)] for group in self._groups)
-        return found + [sources.brightest(*one) for one in spots]
+        return [np.sum([maps[i] for i in group], axis=0) for group in self._groups]
 
-    @cached_property
-    def _spreads(self) -> list[Map]:
-        """Return the variance of the score of a source in every pixel of every map."""
-        return [sources.variance(view.precision, view.response, self.nside, self.lmax) for view in self.views]
+    def with_spreads(self, drawn: Sequence[FilteredMaps]) -> "Scene":
+        """Return the scene with the variances of the scores of sources, by simulations of the model.
+
+        Beside that of noise, with the same shape, they have what the filter leaves of the sky.
+        """
+        each = [sources.variance(view.precision, view.response, self.nside, self.lmax) for view in self.views]
+        noise = [np.sum([each[i] for i in group], axis=0) for group in self._groups]
+        found = [self.bright(one) for one in drawn]
+        excess = [np.mean([sources.excess(one[k], own) for one in found]) for k, own in enumerate(noise)]
+        return replace(self, spreads=tuple(more * own for more, own in zip(excess, noise, strict=True)))
 
     def values(self, filtered: FilteredMaps) -> Vector:
         """Return the scores, shape (len(keys),)."""

@@ -38,6 +38,7 @@ from mcsim.reconstruction.scores import (
     coarse,
 )
 from mcsim.reconstruction.search import LEVEL, Search, evidence
+from mcsim.simulation import simulate
 from mcsim.simulation.pixel_means import signal_of
 from mcsim.simulation.tod import samples
 from mcsim.sphere import alm as alm_
@@ -51,6 +52,8 @@ from mcsim.systematics.spacecraft import axes, spin_phase
 SIMULATIONS = 400
 """Of the model, for mean and covariance of the scores: as many realizations more, once for each model, and once for
 all choices of one data set."""
+
+SPREAD = 8  #: simulations by which the variance of the scores of sources is known, of (lmax + 1)^2 numbers each
 
 SEED = 0x6D63 * 1_000 + 4  #: of these simulations; those of the data vector and of the controls have others
 
@@ -103,7 +106,7 @@ def scene_of(model: Model) -> Scene:
         response = model.response[part.channel]
         moving = _moving(channel.site.pointed("a beam"), grid) if timed else {}
         views.append(View(part.channel, split, moments, waves, moving, seen, {}, part.precision, response, kernel))
-    return Scene(
+    scene = Scene(
         channels=model.channels,
         frequencies=tuple(channel.site.frequency_ghz for channel in model.survey.channels),
         splits=splits,
@@ -118,6 +121,8 @@ def scene_of(model: Model) -> Scene:
         elsewhere=tuple(elsewhere),
         time_lines=tuple(_time_line(model, channel) for channel in range(len(model.channels))) if timed else (),
     )
+    skies = (list(simulate.maps(model.survey, k)) for k in range(SPREAD))
+    return scene.with_spreads([wiener_filter(model, maps) for maps in skies])
 
 
 def with_chosen(model: Model, scene: Scene, kinds: Sequence[str]) -> Scene:

@@ -2,10 +2,8 @@
 
 A source of unit flux adds the beam about its place, b(n), to a map. Its score is the residual (over its noise variance)
 times that, for all places at once one transform. In white noise the variance of the score is the sum over pixels of
-b^2 over the noise variance, which is one more.
+b^2 over the noise variance, which is one more; what a filter leaves of the sky adds to it.
 """
-
-from collections.abc import Sequence
 
 import ducc0
 import healpy
@@ -45,9 +43,15 @@ def variance(precision: Map, response: Cl, nside: int, lmax: int) -> Map:
     return np.where(seen & (found > SEEN * np.median(found[seen])), found, np.inf)
 
 
-def brightest(scores: Sequence[Map], variances: Sequence[Map]) -> Choice:
-    """Return the source that stands out most in the sum of maps of scores."""
-    fall = divided(sum(scores) ** 2, sum(variances), 0.0)
+def excess(scores: Map, variance_: Map) -> float:
+    """Return the mean of squared scores over their variance in noise, where that is known."""
+    seen = np.isfinite(variance_)
+    return float(np.mean(scores[seen] ** 2 / variance_[seen]))
+
+
+def brightest(scores: Map, variance_: Map) -> Choice:
+    """Return the source that stands out most in a map of scores."""
+    fall = divided(scores**2, variance_, 0.0)
     pixel = int(np.argmax(fall))
     lon_deg, lat_deg = healpy.pix2ang(healpy.npix2nside(fall.size), pixel, lonlat=True)
     return Choice(f"source {float(lon_deg)!r} {float(lat_deg)!r}", float(fall[pixel]))

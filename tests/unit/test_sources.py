@@ -61,7 +61,7 @@ def test_a_source_is_the_brightest():
     snr, falls = 10.0, []
     for seed in range(10):
         added = PRECISION * own * snr / np.sqrt(PRECISION @ own**2)
-        found = sources.brightest([scored(white(seed) + added)], [variance])
+        found = sources.brightest(scored(white(seed) + added), variance)
         assert angle_apart(found, Choice("source 40.0 10.0", 0.0)) < 3.0 * SIGMA / snr + healpy.nside2resol(NSIDE)
         falls.append(found.fall)
     assert np.mean(falls) == pytest.approx(snr**2 + 2.0, abs=4.0 * 2.0 * snr / np.sqrt(10) + 0.05 * snr**2)
