@@ -202,15 +202,12 @@ class Scene:
         return [np.sum([maps[i] for i in group], axis=0) for group in self._groups]
 
     def with_spreads(self, drawn: Sequence[FilteredMaps]) -> "Scene":
-        """Return the scene with the variances of the scores of sources, by simulations of the model.
-
-        Beside that of noise, with the same shape, they have what the filter leaves of the sky.
-        """
+        """Return the scene with the variances of the scores of sources, by simulations of the model."""
         each = [sources.variance(view.precision, view.response, self.nside, self.lmax) for view in self.views]
         noise = [np.sum([each[i] for i in group], axis=0) for group in self._groups]
         found = [self.bright(one) for one in drawn]
-        excess = [np.mean([sources.excess(one[k], own) for one in found]) for k, own in enumerate(noise)]
-        return replace(self, spreads=tuple(more * own for more, own in zip(excess, noise, strict=True)))
+        each_own = ((own, [one[k] for one in found]) for k, own in enumerate(noise))
+        return replace(self, spreads=tuple(sources.simulated_variance(*one) for one in each_own))
 
     def values(self, filtered: FilteredMaps) -> Vector:
         """Return the scores, shape (len(keys),)."""

@@ -53,7 +53,7 @@ SIMULATIONS = 400
 """Of the model, for mean and covariance of the scores: as many realizations more, once for each model, and once for
 all choices of one data set."""
 
-SPREAD = 8  #: simulations by which the variance of the scores of sources is known, of (lmax + 1)^2 numbers each
+SPREAD = 40  #: simulations by which the variance of the scores of sources is known
 
 SEED = 0x6D63 * 1_000 + 4  #: of these simulations; those of the data vector and of the controls have others
 

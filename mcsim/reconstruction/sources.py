@@ -5,6 +5,8 @@ times that, for all places at once one transform. In white noise the variance of
 b^2 over the noise variance, which is one more; what a filter leaves of the sky adds to it.
 """
 
+from collections.abc import Sequence
+
 import ducc0
 import healpy
 import numpy as np
@@ -16,6 +18,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.support.arrays import Alm, Cl, Map, Matrix, Vector, divided
 
+COARSE = 4  #: pixels across over which a variance is smoothed
 SEEN = 0.05  #: share of the median variance of the score below which a place is hardly observed
 
 
@@ -43,10 +46,15 @@ def variance(precision: Map, response: Cl, nside: int, lmax: int) -> Map:
     return np.where(seen & (found > SEEN * np.median(found[seen])), found, np.inf)
 
 
-def excess(scores: Map, variance_: Map) -> float:
-    """Return the mean of squared scores over their variance in noise, where that is known."""
-    seen = np.isfinite(variance_)
-    return float(np.mean(scores[seen] ** 2 / variance_[seen]))
+def simulated_variance(noise: Map, scores: Sequence[Map]) -> Map:
+    """Return the variance of scores from simulations of them, its ratio to that in noise smoothed over COARSE pixels.
+
+    Where noise is uneven the filter leaves more of the sky in some parts of it than in others.
+    """
+    nside = healpy.npix2nside(noise.size)
+    ratio = np.where(np.isfinite(noise), np.mean(np.square(scores), axis=0) / noise, healpy.UNSEEN)
+    smooth = healpy.ud_grade(healpy.ud_grade(ratio, max(nside // COARSE, 1)), nside)
+    return np.where(np.isfinite(noise), smooth * noise, np.inf)
 
 
 def brightest(scores: Map, variance_: Map) -> Choice:

@@ -48,6 +48,16 @@ def test_the_variance_of_a_score_is_the_sum_over_pixels(pixel):
     assert found == pytest.approx(PRECISION @ own**2, rel=0.01)
 
 
+def test_the_variance_of_simulations_is_found_where_it_differs():
+    """Scores with twice the variance of noise in one hemisphere, by 40 simulations of smooth maps: 10 %."""
+    noise = sources.variance(PRECISION, BEAM, NSIDE, LMAX)
+    factor = np.where(np.arange(noise.size) < noise.size // 2, 2.0, 1.0)
+    drawn = [np.sqrt(factor) * scored(white(k)) for k in range(40)]
+    found = sources.simulated_variance(noise, drawn) / noise / factor
+    assert abs(np.mean(found) - 1.0) < 0.02
+    assert np.std(found) < 0.3
+
+
 def test_what_is_not_observed_has_no_source():
     half = np.where(np.arange(PRECISION.size) < PRECISION.size // 2, PRECISION, 0.0)
     variance = sources.variance(half, BEAM, NSIDE, LMAX)
