@@ -161,7 +161,7 @@ def refuted(found: HeldOut) -> str:
     if found.after.value < found.before.value:
         removed, forecast = 100.0 * found.achieved.value, 100.0 * found.predicted.value
         does = f"removes {removed:.0f} % of the excess χ² of the other half, where {forecast:.0f} % were predicted"
-    if found.predicted.value < 0.5:
+    if found.pvalue_after <= DISAGREES:
         does += f"; what remains differs from the simulations, p = {number(found.pvalue_after)}"
     return f"simulated with its amplitude from one half, it {does}"
 

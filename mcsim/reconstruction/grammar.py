@@ -250,7 +250,7 @@ def _tried(scene: Scene, kind: str) -> float:
     if kind.startswith("period"):
         return scene.time_lines[0].tried
     if kind.startswith(HISTORIES):
-        return float(3 * (HISTORY - 1) + 2 * len(DECAYS))
+        return float(len(_histories(1.0)))
     if kind.startswith("source"):
         return scene.places
     return float(len(_CROSSINGS)) if kind.startswith("crossing") else 1.0

@@ -12,6 +12,7 @@ from scipy import stats
 
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.diagnosis import words
 from mcsim.diagnosis.inference import confirmed
 from mcsim.diagnosis.refine import PartialExplanation, Refiner
 from mcsim.diagnosis.selection import Attribution, attribute
@@ -436,6 +437,12 @@ def test_set_that_leaves_a_significant_half_is_not_named(bench, achieved, pvalue
     judged, _ = confirmed(context, found, shrink, notes)
     assert judged.verdict == ("effect" if named else "unknown")
     assert named or "what remains differs from the simulations" in notes[0]
+
+
+def test_what_remains_is_said_to_differ_only_if_it_does():
+    raised = (Measured(0.0, 0.1), Measured(-2.0, 0.5), Measured(100.0, 10.0), Measured(300.0, 10.0))
+    assert "differs" not in words.refuted(HeldOut(*raised, 0.4, "half2"))
+    assert "differs" in words.refuted(HeldOut(*raised, 1e-4, "half2"))
 
 
 @pytest.mark.parametrize("before", [1.0, -1.0])
