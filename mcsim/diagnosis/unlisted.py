@@ -169,8 +169,7 @@ class Reconstruction:
             if structure.by_coordinate:
                 each = float(np.linalg.norm(theta)) * np.eye(structure.size)
             shape, share = structure, None
-            own = structure.stage in ("beam", "elsewhere", "noise") or structure.kind.startswith("source")
-            if own and structure.split != ALIKE:  # that of all, in some maps
+            if structure.split != ALIKE and structure.by_map:
                 shape, share = replace(structure, split=ALIKE), np.zeros(len(self.scene.views))
                 share[list(structure.views)] = structure.weights
             effects = [plugin("unlisted", shape, one, self.scene) for one in each]
@@ -256,7 +255,7 @@ class Reconstruction:
         as a pattern's finer structure, would be put down to them, and powers grow faster than in proportion.
         """
         acting = [(w, one) for w, one in zip(chosen, plugins, strict=True) if one is not None]
-        if not acting:
+        if plugins[0] is None:  # the others are what it leaves
             return None
         context, settings = self.data.context, self.data.context.settings
         splits = [view.split for view in self.scene.views]

@@ -26,7 +26,7 @@ from mcsim.systematics.base import Alm, Draw, Effect, Map, Site
 from mcsim.systematics.parametrization import Parametrization, Vector
 from mcsim.systematics.product import multiplied
 from mcsim.systematics.sky import Boost
-from mcsim.systematics.spacecraft import axes, heading, orientation, spin_phase
+from mcsim.systematics.spacecraft import axes, heading, line_of_sight, orientation, spin_phase
 
 REFERENCE_GHZ = 94.0
 _NSIDE = 128  #: of the map that a pattern of low degree is looked up in
@@ -193,8 +193,8 @@ class InTime(Form):
     """Derive forms that depend on time from this class."""
 
     #: "": constant; "spin", "year", "orientation": ``harmonic`` times spin phase, year or psi; "period": ``period_s``
-    #: from the start of the survey on; "trend": from -1 to 1 through the survey; of what is added also "sky": a
-    #: pattern, and those of :meth:`AddedToSamples.components`
+    #: from the start of the survey on; "trend": from -1 to 1 through the survey; "sky": a pattern fixed to it; of what
+    #: is added also those of :meth:`AddedToSamples.components`
     wave: ClassVar[str] = ""
     harmonic: ClassVar[int] = 1
     period_s: ClassVar[float]
@@ -211,10 +211,14 @@ class InTime(Form):
         return np.array(self.splits)[np.clip(place, 0, len(self.splits) - 1)]
 
     def over_time(self, time_s: Vector, psi: Vector | None, site: Site) -> Vector:
-        """Return constant or wave."""
+        """Return constant, pattern or wave."""
         if not self.wave:
             return np.full(len(time_s), self.coefficients[0])
         pointing = site.pointed(self.name)
+        if self.wave == "sky":
+            self.check_frame(site)
+            beam, _ = line_of_sight(pointing, time_s, site.frame)
+            return np.asarray(_maps_of(self.coefficients, (0,))[0][0][healpy.vec2pix(_NSIDE, *beam)])
         if self.wave == "trend":
             return self.coefficients[0] * (2.0 * time_s / (pointing.model.duration_days * SECONDS_PER_DAY) - 1.0)
         if self.wave == "spin":
@@ -271,7 +275,7 @@ class AddedToSamples(InTime):
 
 @dataclass(frozen=True, kw_only=True)
 class GainOverTime(InTime):
-    """The gain of sky and dipole varies in time: a wave, or a constant in some splits."""
+    """The gain of sky and dipole varies in time: a wave, or a constant or a pattern on the sky in some splits."""
 
     def gain(self, time_s: Vector, site: Site) -> Vector | None:
         if self.amplitude == 0.0:

@@ -25,6 +25,7 @@ from mcsim.reconstruction.scores import (
     MONTH,
     ORDERS,
     PERIODIC,
+    SUN,
     TURNED,
     Key,
     Scene,
@@ -42,6 +43,8 @@ LOBE = 2  #: highest degree and spin of what a lobe sees
 
 CROSSINGS, NARROW = 24, (2.0, 8.0)
 """Of the Sun in a lobe: how many spin phases of it are tried, and which concentrations of a von Mises function."""
+
+MOTION = "motion"  #: kind of a rotation that turns with the Sun, as aberration by the Earth's velocity does
 
 ANY = f"1-{HARMONICS}"  #: of a wave in any way: a constant and all harmonics
 
@@ -113,13 +116,21 @@ class Structure:
     @property
     def order(self) -> int:
         """Return the order of a change of the beam."""
-        return int(self.kind.split()[1])
+        return 1 if self.kind == MOTION else int(self.kind.split()[1])
 
     @property
     def moving(self) -> str:
-        """Return the wave that a beam follows, or nothing."""
+        """Return the wave that a beam follows, or the Sun, or nothing."""
+        if self.kind == MOTION:
+            return SUN
         rest = self.kind.split(maxsplit=2)[2:] if self.stage == "beam" else []
         return rest[0] if rest and rest[0].startswith(("spin", "year")) else ""
+
+    @property
+    def by_map(self) -> bool:
+        """Return True if, where it differs between splits, it is that of all splits in some maps."""
+        patterned = self.stage == "gain" and self.frame == "sky"
+        return patterned or self.kind.startswith("source") or self.stage in _IN_MAPS
 
     @property
     def by_coordinate(self) -> bool:
@@ -149,6 +160,9 @@ class Structure:
         return Structure(
             *self.says, self.rows[:, kept], self.weights[kept], self.mix, tuple(self.views[k] for k in kept), self.tried
         )
+
+
+_IN_MAPS = ("beam", "elsewhere", "noise", "square", "cube", "rotation")
 
 
 def _briefly(kind: str) -> list[str]:
@@ -232,10 +246,10 @@ def _of_maps(scene: Scene) -> Iterator[Structure]:
             kept = [i for i in views if factors[scene.views[i].split] != 0.0]
             weights = np.array([factors[scene.views[i].split] for i in kept])
             for stage, acts_on, frame, kind, keys, mix in _forms(scene, split, kept):
-                if name is None and (_fixed(frame, kind) or stage in ("square", "cube")):
+                if name is None and split == ALIKE and (_fixed(frame, kind) or stage in ("square", "cube")):
                     if stage != "added" or kind not in ALSO_COMMON:
-                        continue  # what all channels see alike is the sky itself, which the model knows as random
-                    stage, frame = ("power", "") if split == ALIKE else (stage, frame)
+                        continue  # what all maps see alike is the sky itself, which the model knows as random
+                    stage, frame = "power", ""
                 rows = _rows(scene, keys, kept)
                 own = name, split, None, rows, weights, mix, tuple(kept), _tried(scene, kind)
                 yield Structure(stage, acts_on, frame, kind, *own)
@@ -296,14 +310,26 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
     for s in range(min(scene.split_orders, len(view.w)) + 1):
         for kind, mix in _profiles(scene, s):
             yield "beam", "sky", "scan", kind, _beam(scene, s), mix
-    for wave, s in view.moves:
-        yield "beam", "sky", "scan", f"order {s} {wave}", [("moving", wave, s, c) for c in range(4 if s else 2)], None
+    for wave, s, size in view.moves:
+        moving: list[Key] = [("moving", wave, s, c) for c in range(size)]
+        if wave == SUN:
+            yield "rotation", "sky and dipole", SUN, MOTION, moving, None
+        else:
+            yield "beam", "sky", "scan", f"order {s} {wave}", moving, None
+    yield from _of_the_sky(scene)
     if split != ALIKE:
         return
     for on in PERIODIC if scene.timed else ():
         keys: list[Key] = [("history", on, k) for k in range(HISTORY)]
         for kind, mix in _histories(scene.time_lines[0].duration_s / SECONDS_PER_DAY).items():
             yield "gain" if on else "added", on, "time", kind, keys, mix
+    spin: list[Key] = [("", f"spin {k}", c) for k in range(1, ELONGATION + 1) for c in (0, 1)]
+    for kind, mix in _CROSSINGS.items() if scene.timed else ():
+        yield "added", "", "Sun", kind, [("added", 0), *spin], mix
+
+
+def _of_the_sky(scene: Scene) -> Iterator[_Form]:
+    """Yield what acts on the sky that a map sees: gains with a pattern, powers of the signal, rotations."""
     top = min(GAIN, scene.lmax)
     for acts_on, key in (("sky and dipole", "gain"), ("sky", "gain of the sky")):
         if key != "gain":
@@ -318,9 +344,6 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
     yield "square", "sky", "", "square", [("square of the sky",)], None
     yield "cube", "sky and dipole", "", "cube", [("cube",)], None
     yield "rotation", "sky and dipole", "sky", "rotation", [("rotation", axis) for axis in range(3)], None
-    spin: list[Key] = [("", f"spin {k}", c) for k in range(1, ELONGATION + 1) for c in (0, 1)]
-    for kind, mix in _CROSSINGS.items() if scene.timed else ():
-        yield "added", "", "Sun", kind, [("added", 0), *spin], mix
 
 
 def _timed(scene: Scene, view: View, on: str) -> Iterator[_Form]:

@@ -77,8 +77,8 @@ def _literal(value: Any) -> str:
 def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plugin | None:
     """Return the effect of a structure with fitted coordinates; None if no effect of the simulator can be like it.
 
-    These are powers of unknown patterns, beams that follow a wave, beams, compact sources, signals from elsewhere and
-    noise that differ between splits, and what depends on time or orientation where the pointing is not known.
+    These are powers of unknown patterns, beams that follow a wave, what depends on time or orientation where the
+    pointing is not known, and what differs between splits but is not a gain and does not add to the signal.
     """
     made = _form(structure, theta, scene)
     if made is None:
@@ -129,7 +129,11 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             acting = {"towards": towards, "on_dipole": "dipole" in structure.acts_on}
             return "Elsewhere", {"factor": float(theta[0]), "top": ELSEWHERE, **acting}
         case "gain", _ if not alike:
-            return "GainOverTime", {"coefficients": (float(theta[0]) / CONSTANT,), **splits}
+            value = float(theta[0]) / (1.0 if structure.acts_on == "dipole" else CONSTANT)
+            acting = {"coefficients": (value,)} if structure.kind == "constant" else {"wave": "sky", **timed}
+            if structure.acts_on == "sky and dipole":
+                return "GainOverTime", {**acting, **splits}
+            return "GainOfOne", {"on_sky": structure.acts_on == "sky", **acting, **splits}
         case "gain", _:
             one = (float(theta[0]) * CONSTANT,) if structure.acts_on == "dipole" else pattern
             acting = {"on_sky": "sky" in structure.acts_on, "on_dipole": "dipole" in structure.acts_on}
@@ -139,10 +143,10 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             values = tuple(map(complex, np.reshape(pattern, (-1, 2)) @ [1.0, 1j])) if order else pattern
             edges = scene.edges(max(order, 1))
             return "BeamOrder", {"order": order, "edges": edges, "top": scene.lmax, "values": values}
-        case "square" | "cube", _:
+        case "square" | "cube", _ if alike:
             acting = {"power": 2 if structure.stage == "square" else 3, "on_dipole": "dipole" in structure.acts_on}
             return "SignalPower", {"factor": float(theta[0]), **acting}
-        case "rotation", _:
+        case "rotation", _ if alike and not structure.moving:
             return "RotatedSky", {"rotation": tuple(map(float, theta))}
         case "noise", _ if structure.kind != "spectrum" and alike:
             return "NoisePattern", {"coefficients": pattern}

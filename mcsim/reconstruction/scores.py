@@ -32,6 +32,7 @@ ORDERS = 4  #: highest order of a beam, and of what follows its orientation
 MODULATION = 2  #: highest degree of patterns that multiply the sky itself
 TURNED = {1: 3, 2: 4}  #: highest degree of patterns on the sky that turn with the beam, by their spin
 MOVING = ("year 1", "spin 1", "spin 2")  #: waves that a beam follows
+SUN = "Sun"  #: name of what follows its direction, and that of the Earth's velocity
 MOVED = 2  #: highest order of a beam that follows a wave
 ELONGATION = 6  #: highest harmonic of the spin phase in what depends on the distance from the Sun
 MONTH = (12, 14)  #: harmonics of the year that a month is made of, from 26 to 30 days
@@ -55,7 +56,8 @@ class View:
     w: NDArray[np.complex128]  #: orientation moments, shape (smax, npix)
     #: means over the samples of every pixel of what follows time or orientation: cosine and sine, and so on, by name
     waves: Mapping[str, tuple[Map, ...]]
-    #: means of cos and sin of a wave times exp(-i s psi), shape (2, npix), by the wave and s from 1 on
+    #: means of cos and sin of a wave times exp(-i s psi), shape (2, npix), by the wave and s from 1 on; of the Sun
+    #: those of the Earth's velocity, and of that turned towards the Sun, south less i times east
     moving: Mapping[tuple[str, int], NDArray[np.complex128]]
     #: means over the samples of every coarse pixel of what they see elsewhere, shape (pixels, pixels), by name
     elsewhere: Mapping[str, csr_matrix]
@@ -70,9 +72,10 @@ class View:
         return tuple(s for s in TURNED if s <= len(self.w))
 
     @property
-    def moves(self) -> tuple[tuple[str, int], ...]:
-        """Return the waves that a beam may follow, if times are known, each with its orders."""
-        return tuple((wave, s) for wave in MOVING if (wave, 1) in self.moving for s in range(MOVED + 1))
+    def moves(self) -> tuple[tuple[str, int, int], ...]:
+        """Return what a beam may follow, if times are known: waves and the Sun, orders, and numbers of coordinates."""
+        waves = [(wave, s, 4 if s else 2) for wave in MOVING for s in range(MOVED + 1)]
+        return (*waves, (SUN, 1, 2)) if self.moving else ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +148,7 @@ class Scene:
             found += [(on, i, name, c) for on in ("", *ACTED_ON) for name, c in every]
             found += [("elsewhere", i, name, on) for name in view.elsewhere for on in ACTED_ON[:2]]
             found += [("source", i, kind) for kind in view.sources]
-            found += [("moving", i, wave, s, c) for wave, s in view.moves for c in range(4 if s else 2)]
+            found += [("moving", i, wave, s, c) for wave, s, size in view.moves for c in range(size)]
             found += [("history", i, on, k) for on in PERIODIC for k in range(HISTORY if self.timed else 0)]
             found += [("noise", i, j) for j in range(9)]
             for s in range(min(ORDERS, len(view.w)) + 1):
@@ -232,7 +235,7 @@ class Scene:
             found += [np.array([(r * self.dipole) @ one for one in every])]
             found += self._elsewhere(r, filtered.sky, view)
             found.append(np.array([r @ one for one in view.sources.values()]))
-            found += [_moving(r, view, wave, bent[view.channel][s], s) for wave, s in view.moves]
+            found += [_moving(r, view, wave, bent[view.channel][s], s) for wave, s, _ in view.moves]
             for product in (r, r * whole) if self.timed else ():
                 found.append(self.time_lines[view.channel].history(view.split, product, HISTORY))
             found.append(0.5 * self._patterns[:9] @ divided(r**2, view.precision))
@@ -294,18 +297,20 @@ class Scene:
     def moved(self, wave: str, s: int, theta: Vector, sky: Alm) -> NDArray[np.float64]:
         """Return what a derivative of a sky adds to every map that follows a wave, uK, shape (maps, npix).
 
-        ``theta``: coordinates of the structure, of cosine and then of sine, for s > 0 along and across the beam's x.
+        ``theta``: coordinates of the structure, of cosine and then of sine, for s > 0 along and across the beam's x; of
+        the Sun along the Earth's velocity and towards the Sun.
         """
         added, pairs = np.zeros((len(self.views), 12 * self.nside**2)), np.reshape(theta, (2, -1))
+        along = pairs[:, 0] if s == 0 or wave == SUN else pairs @ [1.0, -1j]
         looked_at = sky + dipole_alm(self.dipole_uk, self.lmax)
         for c in range(len(self.channels)):
             field = self._derivatives(looked_at, self.views[self.of(c)[0]].response)[s]
             for i in self.of(c):
                 if s == 0:
-                    means = np.tensordot(pairs[:, 0], self.views[i].waves[wave], axes=1)
+                    means = np.tensordot(along, self.views[i].waves[wave], axes=1)
                     added[i] = field[0] * means
                 else:
-                    turned = pairs @ [1.0, -1j] @ self.views[i].moving[wave, s]
+                    turned = along @ self.views[i].moving[wave, s]
                     added[i] = field[0] * turned.real - field[1] * turned.imag
         return added
 
@@ -361,10 +366,15 @@ def _turned(r: Map, view: View) -> list[Vector]:
 
 
 def _moving(r: Map, view: View, wave: str, field: NDArray[np.float64], s: int) -> Vector:
-    """Return the scores of a derivative of the sky along and across the beam's x axis, times cosine and sine."""
+    """Return the scores of a derivative of the sky along and across the beam's x axis, times cosine and sine.
+
+    Of the Sun they are those of the gradient along the Earth's velocity, and towards the Sun.
+    """
     if s == 0:
         return np.array([(r * field[0]) @ one for one in view.waves[wave]])
     q, u, w = r * field[0], r * field[1], view.moving[wave, s]
+    if wave == SUN:
+        return np.array([q @ one.real - u @ one.imag for one in w])
     return np.array([f for one in w for f in (q @ one.real - u @ one.imag, u @ one.real + q @ one.imag)])
 
 

@@ -33,6 +33,7 @@ from mcsim.reconstruction.scores import (
     MOVING,
     ORDERS,
     PERIODIC,
+    SUN,
     Scene,
     View,
     coarse,
@@ -47,7 +48,7 @@ from mcsim.support import folders
 from mcsim.support.arrays import Map, Matrix, Vector, divided
 from mcsim.support.code import package_digest
 from mcsim.systematics import Pointing
-from mcsim.systematics.spacecraft import axes, spin_phase
+from mcsim.systematics.spacecraft import axes, heading, spin_phase
 
 SIMULATIONS = 400
 """Of the model, for mean and covariance of the scores: as many realizations more, once for each model, and once for
@@ -213,19 +214,25 @@ def _elsewhere(pointing: Pointing, grid: MapGrid, wanted: Mapping[str, Matrix]) 
 
 
 def _moving(pointing: Pointing, grid: MapGrid) -> dict[tuple[str, int], NDArray[np.complex128]]:
-    """Return the mean over the samples of every pixel of cos and sin of waves times exp(-i s psi), (2, npix) each."""
-    total = {(wave, s): np.zeros((2, grid.npix), dtype=np.complex128) for wave in MOVING for s in range(1, MOVED + 1)}
+    """Return :attr:`View.moving` of a map."""
+    followed = [(wave, s) for wave in MOVING for s in range(1, MOVED + 1)]
+    total = {one: np.zeros((2, grid.npix), dtype=np.complex128) for one in (*followed, (SUN, 1))}
     hits = np.zeros(grid.npix)
     for chunk in samples(*_thinned(pointing, grid, VISITS), grid):
         year = 2.0 * np.pi * chunk.time_s / pointing.model.orbit_period_s
         phases = {"year": year, "spin": spin_phase(pointing, chunk.time_s)}
         hits += np.bincount(chunk.pixel, minlength=grid.npix)
-        for (wave, s), both in total.items():
+        for wave, s in followed:
             name, harmonic = wave.split()
-            for row, function in zip(both, (np.cos, np.sin), strict=True):
+            for row, function in zip(total[wave, s], (np.cos, np.sin), strict=True):
                 value = function(int(harmonic) * phases[name]) * np.exp(-1j * s * chunk.psi)
                 row.real += np.bincount(chunk.pixel, value.real, grid.npix)
                 row.imag += np.bincount(chunk.pixel, value.imag, grid.npix)
+        _, south, east = axes(chunk.theta, chunk.phi)
+        for row, turn in zip(total[SUN, 1], (0.0, 0.5 * np.pi), strict=True):
+            velocity = heading(pointing.model, chunk.time_s, grid.frame, turn)
+            row.real += np.bincount(chunk.pixel, np.sum(velocity * south, axis=0), grid.npix)
+            row.imag -= np.bincount(chunk.pixel, np.sum(velocity * east, axis=0), grid.npix)
     return {key: both * divided(1.0, hits) for key, both in total.items()}
 
 

@@ -99,6 +99,8 @@ def _what(structure: Structure, theta: Vector) -> str:
             return f"follows the square of {structure.acts_on}"
         case "cube", _:
             return f"follows the cube of {structure.acts_on}"
+        case "rotation", "Sun":
+            return "follows the gradient of the sky along the Earth's motion, or towards the Sun"
         case "rotation", _:
             return "follows the gradient of the sky along a rotation fixed to the sky"
         case "noise", _:

@@ -22,8 +22,11 @@ def spin_phase(pointing: Pointing, time_s: Vector) -> Vector:
     return np.asarray(2.0 * np.pi * (time_s / model.spin_period_s % 1.0) + np.deg2rad(start_deg))
 
 
-def orientation(pointing: Pointing, time_s: Vector, frame: str) -> Vector:
-    """Return psi of the beam at some times, radians; :class:`mcsim.instrument.scan.ScanModel` has the rotations."""
+def line_of_sight(pointing: Pointing, time_s: Vector, frame: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return unit vectors along the line of sight and its motion at some times, shape (3, n) each.
+
+    :class:`mcsim.instrument.scan.ScanModel` has the rotations.
+    """
     model, line, spin = pointing.model, pointing.line, spin_phase(pointing, time_s)
     sin_b, cos_b = (f(np.deg2rad(line.boresight_angle_deg)) for f in (np.sin, np.cos))
     beam = np.stack([sin_b * np.cos(spin), sin_b * np.sin(spin), np.full(spin.shape, cos_b)])
@@ -37,6 +40,12 @@ def orientation(pointing: Pointing, time_s: Vector, frame: str) -> Vector:
             a, b = one[plane[0]].copy(), one[plane[1]].copy()
             one[plane[0]], one[plane[1]] = np.cos(angle) * a - np.sin(angle) * b, np.sin(angle) * a + np.cos(angle) * b
     beam, along = (rotation_matrix("ecliptic", frame) @ one for one in (beam, along))
+    return beam, along
+
+
+def orientation(pointing: Pointing, time_s: Vector, frame: str) -> Vector:
+    """Return psi of the beam at some times, radians."""
+    beam, along = line_of_sight(pointing, time_s, frame)
     _, south, east = axes(np.arctan2(np.hypot(beam[0], beam[1]), beam[2]), np.arctan2(beam[1], beam[0]))
     return np.arctan2(np.sum(along * east, axis=0), np.sum(along * south, axis=0))
 

@@ -22,6 +22,7 @@ from mcsim.reconstruction.figure import structure_figure
 from mcsim.reconstruction.grammar import ALIKE, structures
 from mcsim.reconstruction.plugin import Plugin, plugin
 from mcsim.reconstruction.result import Reconstructed
+from mcsim.reconstruction.scores import SUN
 from mcsim.reconstruction.search import Search
 from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import survey
@@ -73,6 +74,16 @@ TOLERANCE = {
 }
 
 
+def added_by(structure, theta):
+    """Return what the effect that a structure becomes adds to every map of the filtered sky in the simulator."""
+    run, scene, filtered, _ = seen()
+    effect = plugin("unlisted_1", structure, theta, scene)
+    table = config.Effect(name="unlisted_1", channel="W1", parameters={"amplitude": 1.0})
+    acting = survey(replace(run, effects=(table,)), library={"unlisted_1": effect.kind()})
+    before = simulate.maps(survey(run), 0, sky=filtered.sky)
+    return [a - b for a, b in zip(simulate.maps(acting, 0, sky=filtered.sky), before, strict=True)]
+
+
 @pytest.mark.parametrize(
     ("stage", "frame", "kind", "split"),
     [
@@ -99,6 +110,8 @@ TOLERANCE = {
         ("gain", "", "constant", ALIKE),
         ("gain", "", "constant", "half2"),
         ("gain", "sky", "degrees 0-2", ALIKE),
+        ("gain", "sky", "degrees 0-2", "half2"),
+        ("gain", "sky", "latitude galactic", "opposite"),
         ("gain", "time", "year 1", ALIKE),
         ("gain", "time", "spin 3", ALIKE),
         ("gain", "time", "trend", ALIKE),
@@ -135,20 +148,48 @@ TOLERANCE = {
 )
 def test_a_score_is_the_product_of_residuals_and_what_the_effect_adds(stage, frame, kind, split):
     """The effect that a structure becomes, in the simulator, adds the map whose product with the residual it scores."""
-    run, scene, filtered, u = seen()
+    _, _, filtered, u = seen()
     structure = next(
         w for w in grammar() if (w.stage, w.frame, w.kind, w.split, w.channel) == (stage, frame, kind, split, "W1")
     )
     theta = np.random.default_rng(3).normal(size=structure.size) * 1e-3
-    effect = plugin("unlisted_1", structure, theta, scene)
-    table = config.Effect(name="unlisted_1", channel="W1", parameters={"amplitude": 1.0})
-    acting = survey(replace(run, effects=(table,)), library={"unlisted_1": effect.kind()})
-    before = simulate.maps(survey(run), 0, sky=filtered.sky)
-    added = [a - b for a, b in zip(simulate.maps(acting, 0, sky=filtered.sky), before, strict=True)]
+    added = added_by(structure, theta)
     assert not np.any(added[:2])  # the other channel
     products = np.array([r @ one for r, one in zip(filtered.residual, added, strict=True)])
     scale = np.sqrt(sum(r @ r * (one @ one) for r, one in zip(filtered.residual, added, strict=True)) / NSIDE**2 / 12)
     assert abs(products.sum() - theta @ structure.of(u)) < TOLERANCE.get(kind, TOLERANCE.get(stage, 0.01)) * scale
+
+
+def in_half_and_both(stage, acts_on, kind):
+    """Return the same structure of W1 in the second half, and in both."""
+    every = (w for split in ("half2", ALIKE) for w in grammar() if w.channel == "W1" and w.split == split)
+    return [w for w in every if (w.stage, w.acts_on, w.kind) == (stage, acts_on, kind) and w.frame != SUN]
+
+
+@pytest.mark.parametrize(
+    ("stage", "acts_on"), [("rotation", "sky and dipole"), ("square", "sky"), ("cube", "sky and dipole")]
+)
+def test_in_one_half_a_structure_is_that_of_both_in_its_maps(stage, acts_on):
+    """What no effect of the simulator can do to one half is simulated by that of both, in the maps of the half."""
+    _, scene, filtered, u = seen()
+    half, both = in_half_and_both(stage, acts_on, stage)
+    theta = np.random.default_rng(5).normal(size=half.size) * 1e-3
+    assert half.by_map
+    assert plugin("unlisted_1", half, theta, scene) is None
+    added, residual = added_by(both, theta)[3], filtered.residual[3]
+    scale = np.sqrt(residual @ residual * (added @ added) / len(added))
+    assert abs(residual @ added - theta @ half.of(u)) < TOLERANCE[stage] * scale
+
+
+@pytest.mark.parametrize("acts_on", ["sky and dipole", "sky"])
+def test_a_gain_with_a_pattern_in_one_half_is_that_of_both_there(acts_on):
+    half, both = in_half_and_both("gain", acts_on, "degrees 0-1")
+    theta = np.random.default_rng(6).normal(size=half.size) * 1e-3
+    found, expected = added_by(half, theta), added_by(both, theta)
+    assert not np.any(found[2])
+    whole = added_by(in_half_and_both("gain", "sky and dipole", "degrees 0-1")[1], theta)[3]
+    difference = found[3] - expected[3]  # pixels of the pattern, and offsets of samples in pixels
+    assert np.std(difference) < 0.01 * np.std(whole)
 
 
 def test_real_harmonics_are_those_of_a_lm():
@@ -173,7 +214,7 @@ def test_a_rotation_moves_the_map():
         np.testing.assert_allclose(found, moved, atol=1e-3 * np.abs(moved).max())
 
 
-@pytest.mark.parametrize("kind", ["order 0 year 1", "order 1 spin 1", "order 2 spin 2"])
+@pytest.mark.parametrize("kind", ["order 0 year 1", "order 1 spin 1", "order 2 spin 2", "motion"])
 def test_a_score_of_a_beam_that_moves_is_the_product_with_its_maps(kind):
     _, scene, filtered, u = seen()
     structure = next(w for w in grammar() if (w.kind, w.channel, w.split) == (kind, "W1", "half2"))
@@ -183,22 +224,31 @@ def test_a_score_of_a_beam_that_moves_is_the_product_with_its_maps(kind):
     assert plugin("unlisted_1", structure, theta, scene) is None
 
 
-def test_a_pointing_that_nods_moves_the_dipole():
-    """A displacement along the beam's x axis, cos(spin phase) of it, adds the dipole's change to every sample."""
+@pytest.mark.parametrize(
+    ("wave", "coordinates"), [("spin 1", [1.0, 0.0, 0.0, 0.0]), ("Sun", [1.0, 0.0]), ("Sun", [0.0, 1.0])]
+)
+def test_a_pointing_that_moves_moves_the_dipole(wave, coordinates):
+    """A displacement adds the dipole's change to every sample.
+
+    It is along the beam's x axis, cos(spin phase) of it, or along the Earth's velocity, or towards the Sun.
+    """
     run, scene, filtered, _ = seen()
     site, span = survey(run).channels[1].site, run.map.span(1)
     model, line = site.pointing.model, site.pointing.line
 
     def change(chunk):
-        _, south, east = spacecraft.axes(chunk.theta, chunk.phi)
+        outward, south, east = spacecraft.axes(chunk.theta, chunk.phi)
+        if wave == "Sun":
+            towards = spacecraft.heading(model, chunk.time_s, "ecliptic", 0.5 * np.pi * coordinates[1])
+            return scene.dipole_uk @ (towards - outward * np.sum(towards * outward, axis=0))
         along = np.cos(chunk.psi) * south + np.sin(chunk.psi) * east
         return np.cos(spacecraft.spin_phase(site.pointing, chunk.time_s)) * (scene.dipole_uk @ along)
 
     stream = tod.with_signal(change)(tod.samples(model, line, MapGrid(NSIDE, "ecliptic", span)))
     expected, hits = tod.bin_samples(stream, NSIDE)
     (view,) = (view for view in scene.views if (view.channel, view.split) == (1, 1))
-    unit = np.array([LMAX, 0.0, 0.0, 0.0]) / view.response[1]
-    found = scene.moved("spin 1", 1, unit, np.zeros_like(filtered.sky))[3]
+    unit = LMAX * np.array(coordinates) / view.response[1]
+    found = scene.moved(wave, 1, unit, np.zeros_like(filtered.sky))[3]
     difference = (found - expected)[hits > 0]  # samples are not at the centres of pixels
     assert np.std(difference) < 0.05 * np.std(expected[hits > 0])
 

@@ -254,8 +254,8 @@ def true(number):
     for model in (ONE, MODEL):
         run, context = learned(model)
         sky = ObservedMaps(context, list(simulate.maps(survey(run), 0)), ask)
-        skies = context.settings.channel_skies
-        rivals = [(one, sky.response(one, skies)) for one in on_request(context.analysis) if not one.random_response]
+        asked = [one for one in on_request(context.analysis) if not one.random_response]
+        rivals = list(sky.responses(asked, context.settings.channel_skies))
         linear = linear_model(context)
         own = {"null": linear.null, "calibration": linear.calibration, "templates": linear.templates}
         known = replace(context, candidates=linear.candidates, groups=linear.groups, **own)
