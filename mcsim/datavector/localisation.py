@@ -22,15 +22,14 @@ class Place:
 def places(x: Vector, simulations: Vector, elements: Sequence[Element], level: float = 0.01) -> list[Place]:
     """Rank groups of numbers, shape (B,), by their departure from simulations, shape (N, B).
 
-    Elements that share statistic, channels, split, frame, L, M and parity are a group. One group of each kind comes
-    before the others of it if its global p-value is at most ``level``.
+    Elements that share statistic, channels, split, frame, L, M and parity are a group. Groups with a global p-value up
+    to ``level`` come first; of these, and of the others, one of each kind comes before the rest of it.
 
     Notes
     -----
     A kind is a frame, an L and a parity: one effect shows in every channel and split that it acts on, and a list of
-    these would hide all else. Groups that are not significant stay in the order of their deviates. The cube root of a
-    group's sum of squared deviates is nearly normal (Wilson & Hilferty, PNAS 17, 684, 1931); it is compared with those
-    of the simulations, each taken against the others.
+    these would hide all else. The cube root of a group's sum of squared deviates is nearly normal (Wilson & Hilferty,
+    PNAS 17, 684, 1931); it is compared with those of the simulations, each taken against the others.
     """
     mean, spread = simulations.mean(axis=0), simulations.std(axis=0, ddof=1)
     spread = np.where(spread > 0, spread, np.inf)
@@ -45,17 +44,15 @@ def places(x: Vector, simulations: Vector, elements: Sequence[Element], level: f
     z, p = scan_pvalues(np.cbrt(found), np.cbrt(drawn))
     # A group with too small deviates is no departure.
     p = np.where(z > 0, p, 1.0)
-    firsts: list[Place] = []
-    rest: list[Place] = []
+    ranked: list[tuple[bool, bool, Place]] = []
     seen: set[tuple[object, ...]] = set()
     for group in np.argsort(-z):
         most = max(rows[group], key=lambda number: abs(deviates[number]))
         place = Place(elements[most], float(z[group]), float(p[group]))
         kind = (place.element.frame, place.element.L, place.element.parity)
-        new = kind not in seen and (place.p <= level or not seen)
-        (firsts if new else rest).append(place)
+        ranked.append((place.p > level, kind in seen, place))
         seen.add(kind)
-    return firsts + rest
+    return [place for _, _, place in sorted(ranked, key=lambda one: one[:2])]
 
 
 def standardised(x: Map, mean: Map, scatter: Map, count: int) -> Map:

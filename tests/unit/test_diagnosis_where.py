@@ -33,6 +33,11 @@ def test_what_is_not_significant_is_brought_before_nothing():
     assert ranked([9.0, 12.0, 10.0, 1.0, 0.1])[:3] == [("W1", 2), ("W2", 2), ("V1", 2)]
 
 
+def test_of_what_is_not_significant_each_kind_comes_before_more_of_the_same():
+    assert ranked([1.5, 2.0, 1.8, 1.0, 0.1])[:4] == [("W1", 2), ("V1", 1), ("W1", 0), ("W2", 2)]
+    assert ranked([9.0, 2.0, 1.8, 1.0, 0.1])[:3] == [("V1", 2), ("V1", 1), ("W1", 0)]
+
+
 @pytest.mark.parametrize("split", ["half1", "half2"])
 def test_power_at_high_degrees_keeps_its_split(split):
     """Power of one map above its lowest bin is no power that the splits have in common."""
