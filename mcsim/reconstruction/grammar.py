@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.special import ive, poch
+from scipy.special import poch
 
 from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.reconstruction.forms import REFERENCE_GHZ
@@ -31,6 +31,7 @@ from mcsim.reconstruction.scores import (
     Scene,
     View,
 )
+from mcsim.reconstruction.time_functions import HISTORIES, LOBES, histories
 from mcsim.sphere import real
 from mcsim.sphere.rotation import FRAMES, rotation_matrix
 from mcsim.support.arrays import Matrix, Vector
@@ -40,9 +41,6 @@ ALIKE, OPPOSITE = "alike", "opposite"
 FREE = 5  #: coordinates of a pattern on the sky whose responses are simulated one by one, at most
 
 LOBE = 2  #: highest degree and spin of what a lobe sees
-
-CROSSINGS, NARROW = 24, (2.0, 8.0)
-"""Of the Sun in a lobe: how many spin phases of it are tried, and which concentrations of a von Mises function."""
 
 MOTION = "motion"  #: kind of a rotation that turns with the Sun, as aberration by the Earth's velocity does
 
@@ -171,44 +169,6 @@ def _briefly(kind: str) -> list[str]:
     return kind.split()[: 1 if kind.startswith(("degrees", "crossing", "source")) else 2]
 
 
-def _crossing(phase: float, narrow: float) -> Matrix:
-    """Return a constant, and cosines and sines of the spin phase, of exp(narrow cos(phase of the spin - phase)).
-
-    A lobe whose response is exponential in the cosine of the distance from its axis sees the Sun so, whose distance
-    from the spin axis is fixed: a von Mises function, of modified Bessel functions.
-    """
-    k = np.arange(1, ELONGATION + 1)
-    waves = ive(k, narrow)[:, None] * np.stack([np.cos(k * phase), np.sin(k * phase)], axis=1)
-    return np.append(ive(0, narrow) * np.sqrt(4.0 * np.pi), 2.0 * waves)[None]
-
-
-_CROSSINGS = {
-    f"crossing {360 * n // CROSSINGS} {narrow:g}": _crossing(2.0 * np.pi * n / CROSSINGS, narrow)
-    for narrow in NARROW
-    for n in range(CROSSINGS)
-}
-
-
-HISTORIES = ("from", "until", "step", "decay", "rise")
-"""What is there from a day on, until a day, has another value from a day on, falls since the start of the survey, or
-rises until its end."""
-
-DECAYS = (1 / 16, 1 / 8, 1 / 4)  #: times in which a decay has fallen by e, as fractions of the survey
-
-
-def _histories(days: float) -> dict[str, Matrix]:
-    """Return the values of functions of a survey's time in its equal parts, shape (1 or 2, HISTORY), by their kind."""
-    found, part = dict[str, Matrix](), np.arange(HISTORY)
-    for first in range(1, HISTORY):
-        after, day = (part >= first).astype(float), f"{days * first / HISTORY:.4g}"
-        found |= {f"from {day}": after[None], f"until {day}": 1.0 - after[None]}
-        found[f"step {day}"] = np.stack([np.ones(HISTORY), 2.0 * after - 1.0])
-    for lifetime in DECAYS:
-        fallen = np.exp(-part / HISTORY / lifetime)[None]
-        found |= {f"decay {days * lifetime:.3g}": fallen, f"rise {days * lifetime:.3g}": fallen[:, ::-1]}
-    return found
-
-
 def structures(scene: Scene) -> tuple[Structure, ...]:
     """Return every structure of the grammar for the maps of a survey."""
     found = [*_of_maps(scene), *_of_channels(scene)]
@@ -264,10 +224,10 @@ def _tried(scene: Scene, kind: str) -> float:
     if kind.startswith("period"):
         return scene.time_lines[0].tried
     if kind.startswith(HISTORIES):
-        return float(len(_histories(1.0)))
+        return float(len(histories(1.0)))
     if kind.startswith("source"):
         return scene.places
-    return float(len(_CROSSINGS)) if kind.startswith("crossing") else 1.0
+    return float(len(LOBES)) if kind.startswith("crossing") else 1.0
 
 
 def _fixed(frame: str, kind: str) -> bool:
@@ -321,10 +281,10 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
         return
     for on in PERIODIC if scene.timed else ():
         keys: list[Key] = [("history", on, k) for k in range(HISTORY)]
-        for kind, mix in _histories(scene.time_lines[0].duration_s / SECONDS_PER_DAY).items():
+        for kind, mix in histories(scene.time_lines[0].duration_s / SECONDS_PER_DAY).items():
             yield "gain" if on else "added", on, "time", kind, keys, mix
     spin: list[Key] = [("", f"spin {k}", c) for k in range(1, ELONGATION + 1) for c in (0, 1)]
-    for kind, mix in _CROSSINGS.items() if scene.timed else ():
+    for kind, mix in LOBES.items() if scene.timed else ():
         yield "added", "", "Sun", kind, [("added", 0), *spin], mix
 
 

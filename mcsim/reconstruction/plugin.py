@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from mcsim.reconstruction.forms import FORMS, Form
-from mcsim.reconstruction.grammar import ALIKE, ANY, HISTORIES, LOBE, OPPOSITE, Structure
+from mcsim.reconstruction.grammar import ALIKE, ANY, LOBE, OPPOSITE, Structure
 from mcsim.reconstruction.scores import ELSEWHERE, MONTH, Scene
+from mcsim.reconstruction.time_functions import HISTORIES
 from mcsim.support.arrays import Vector
 
 CONSTANT = float(np.sqrt(4.0 * np.pi))  #: real coefficient of degree 0 of a map that is one everywhere
