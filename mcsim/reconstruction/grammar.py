@@ -44,6 +44,8 @@ LOBE = 2  #: highest degree and spin of what a lobe sees
 
 MOTION = "motion"  #: kind of a rotation that turns with the Sun, as aberration by the Earth's velocity does
 
+MEANS = ("monopole", "constant", "level")  #: kinds that are the mean of others: in time, on the sky, of noise
+
 ANY = f"1-{HARMONICS}"  #: of a wave in any way: a constant and all harmonics
 
 ALSO_COMMON = ("monopole", "dipole", "degrees 0-1")
@@ -313,7 +315,8 @@ def _timed(scene: Scene, view: View, on: str) -> Iterator[_Form]:
     an even function of the spin phase.
     """
     stage = "gain" if on else "added"
-    waves: dict[str, list[Key]] = {name: [(on, name, c) for c in range(len(own))] for name, own in view.waves.items()}
+    known = {**view.waves, **view.periods}
+    waves: dict[str, list[Key]] = {name: [(on, name, c) for c in range(len(own))] for name, own in known.items()}
     for name, keys in waves.items():
         wave, _, harmonic = name.partition(" ")
         if wave == "period" or (wave != "Sun" and int(harmonic or 1) <= HARMONICS):

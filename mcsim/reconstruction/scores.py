@@ -61,7 +61,9 @@ class View:
     moving: Mapping[tuple[str, int], NDArray[np.complex128]]
     #: means over the samples of every coarse pixel of what they see elsewhere, shape (pixels, pixels), by name
     elsewhere: Mapping[str, csr_matrix]
-    sources: Mapping[str, Map]  #: what compact sources of unit flux add, by their kind in the grammar
+    #: periods, sources: what the data choose: means of waves, and what compact sources of unit flux add, by their kind
+    periods: Mapping[str, tuple[Map, ...]]
+    sources: Mapping[str, Map]
     precision: Map  #: one over the variance of the noise
     response: Cl  #: B_l w_l of the channel, shape (lmax + 1,)
     kernel: Cl  #: b_l0 of its beam, shape (lmax + 1,)
@@ -144,10 +146,8 @@ class Scene:
             for s in view.spins:
                 found += [("turned", i, s, p, j) for p in (0, 1) for j in range(s**2, (TURNED[s] + 1) ** 2)]
             found += [("lobe", i, 0), ("lobe", i, 1), *(("rotation", i, axis) for axis in range(3))]
-            every = [(name, c) for name, maps in view.waves.items() for c in range(len(maps))]
-            found += [(on, i, name, c) for on in ("", *ACTED_ON) for name, c in every]
-            found += [("elsewhere", i, name, on) for name in view.elsewhere for on in ACTED_ON[:2]]
-            found += [("source", i, kind) for kind in view.sources]
+            found += _keys_of(i, view.waves)
+            found += [("elsewhere", i, name, on) for on in ACTED_ON[1::-1] for name in view.elsewhere]
             found += [("moving", i, wave, s, c) for wave, s, size in view.moves for c in range(size)]
             found += [("history", i, on, k) for on in PERIODIC for k in range(HISTORY if self.timed else 0)]
             found += [("noise", i, j) for j in range(9)]
@@ -160,6 +160,8 @@ class Scene:
                 found += [(kind, channel, b) for kind in ("difference", "common") for b in range(len(self.fine) - 1)]
         found += [("power", b) for b in range(len(self.fine) - 1)]
         found += [("modulation", j) for j in range((MODULATION + 1) ** 2)] + [("boost", axis) for axis in range(3)]
+        for i, view in enumerate(self.views):
+            found += [*_keys_of(i, view.periods), *(("source", i, kind) for kind in view.sources)]
         return tuple(found)
 
     @cached_property
@@ -214,6 +216,18 @@ class Scene:
 
     def values(self, filtered: FilteredMaps) -> Vector:
         """Return the scores, shape (len(keys),)."""
+        return np.concatenate([self.listed_values(filtered), self.chosen_values(filtered)])
+
+    def chosen_values(self, filtered: FilteredMaps) -> Vector:
+        """Return the scores of what the data choose, the last of :meth:`values`."""
+        found: list[NDArray[np.float64]] = [np.zeros(0)]
+        for i, view in enumerate(self.views):
+            found += self._waves(filtered, i, view.periods)
+            found.append(np.array([filtered.residual[i] @ one for one in view.sources.values()]))
+        return np.concatenate(found)
+
+    def listed_values(self, filtered: FilteredMaps) -> Vector:
+        """Return the scores of the grammar without choices, the first of :meth:`values`."""
         found: list[NDArray[np.float64]] = []
         looked_at = filtered.sky + dipole_alm(self.dipole_uk, self.lmax)
         turned = rotations(looked_at, self.lmax)
@@ -228,13 +242,8 @@ class Scene:
             found += [*_turned(r, view), np.array(self._lobe(r, view))]
             through = (alm_.multiply(one, view.response, self.lmax) for one in turned)
             found.append(np.array([_product(adjoint, one, self.lmax) for one in through]))
-            every = [one for maps in view.waves.values() for one in maps]
-            found += [np.array([field @ one for one in every]) for field in (r, r * whole)]
-            lost = self._leak(adjoint) * sky
-            found += [np.array([(r * sky - lost) @ one for one in every])]
-            found += [np.array([(r * self.dipole) @ one for one in every])]
-            found += self._elsewhere(r, filtered.sky, view)
-            found.append(np.array([r @ one for one in view.sources.values()]))
+            found += self._waves(filtered, i, view.waves)
+            found += self._elsewhere(r, filtered.sky, i)
             found += [_moving(r, view, wave, bent[view.channel][s], s) for wave, s, _ in view.moves]
             for product in (r, r * whole) if self.timed else ():
                 found.append(self.time_lines[view.channel].history(view.split, product, HISTORY))
@@ -271,16 +280,31 @@ class Scene:
         low = real.coefficients(adjoint, self.lmax, 1) @ self._patterns[:4]
         return np.asarray(4.0 * np.pi / low.size * low)
 
-    def _elsewhere(self, r: Map, sky: Alm, view: View) -> list[Vector]:
-        """Return the scores of sky and dipole, and of the sky alone, in the directions of samples elsewhere."""
+    def _waves(self, filtered: FilteredMaps, i: int, waves: Mapping[str, tuple[Map, ...]]) -> list[Vector]:
+        """Return the scores of waves in a map: added, and times what they act on."""
+        r, sky, every = filtered.residual[i], filtered.expected[i], [one for maps in waves.values() for one in maps]
+        on_sky = r * sky - self._leak(filtered.adjoint[i]) * sky
+        fields = (r, r * (sky + self.dipole), on_sky, r * self.dipole)
+        return [np.array([field @ one for one in every]) for field in fields]
+
+    @cached_property
+    def _dipole_elsewhere(self) -> list[list[Map]]:
+        """Return the dipole in the directions of samples elsewhere, of every map and of all names, uK."""
+        nside = coarse(self.nside)
+        dipole = self.dipole_uk @ np.stack(healpy.pix2vec(nside, np.arange(12 * nside**2)))
+        return [[one @ dipole for one in view.elsewhere.values()] for view in self.views]
+
+    def _elsewhere(self, r: Map, sky: Alm, i: int) -> list[Vector]:
+        """Return the scores of the sky alone, and of sky and dipole, in the directions of samples elsewhere."""
+        view = self.views[i]
         if not view.elsewhere:
             return []
         top, nside = min(ELSEWHERE, self.lmax), coarse(self.nside)
         seen = alm_.resize(alm_.multiply(sky, view.response, self.lmax), self.lmax, top)
         alone = healpix.synthesis(seen[None], nside, top)[0]
-        whole = alone + self.dipole_uk @ np.stack(healpy.pix2vec(nside, np.arange(12 * nside**2)))
         summed = healpy.ud_grade(r, nside, power=-2)
-        return [np.array([summed @ (one @ whole), summed @ (one @ alone)]) for one in view.elsewhere.values()]
+        of_sky = np.array([summed @ (one @ alone) for one in view.elsewhere.values()])
+        return [of_sky, of_sky + np.array([summed @ one for one in self._dipole_elsewhere[i]])]
 
     def _orders(self, view: View, orders: NDArray[np.complex128], i: int) -> list[Vector]:
         ell, found = np.arange(self.lmax + 1), []
@@ -349,6 +373,11 @@ class Scene:
                 [_product(expected, moved, self.lmax) for moved in boosts(sky, self.lmax)],
             ]
         )
+
+
+def _keys_of(i: int, waves: Mapping[str, tuple[Map, ...]]) -> list[Key]:
+    """Name the scores of waves in a map."""
+    return [(on, i, name, c) for on in ("", *ACTED_ON) for name, maps in waves.items() for c in range(len(maps))]
 
 
 def coarse(nside: int) -> int:

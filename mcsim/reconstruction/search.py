@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.reconstruction.grammar import ALIKE, ANY, Structure
+from mcsim.reconstruction.grammar import ALIKE, ANY, MEANS, Structure
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 
@@ -166,9 +166,13 @@ class Search:
     @cached_property
     def constants(self) -> dict[int, int]:
         """Return the structure that is the constant of a function of time, which is measured by itself."""
-        longer = [k for k, one in enumerate(self.grammar) if any(map(one.extends, self.grammar))]
-        first = {k: next(j for j, one in enumerate(self.grammar) if self.grammar[k].extends(one)) for k in longer}
-        return {k: j for k, j in first.items() if self.nulls[j] is not None and self.nulls[k] is not None}
+        means = {k: one for k, one in enumerate(self.grammar) if one.kind in MEANS and self.nulls[k] is not None}
+        found = {}
+        for k, structure in enumerate(self.grammar):
+            mean = next((j for j, one in means.items() if structure.extends(one)), None)
+            if mean is not None and self.nulls[k] is not None:
+                found[k] = mean
+        return found
 
     def _evidences(self, falls: NDArray[np.float64], members: Sequence[int]) -> NDArray[np.float64]:
         """Return evidences from the falls of chi^2 of members, shape (members, n); not measured: NaN, and -inf.

@@ -106,7 +106,7 @@ def scene_of(model: Model) -> Scene:
         seen = _elsewhere(channel.site.pointed("elsewhere"), grid, elsewhere[part.channel]) if timed else {}
         response = model.response[part.channel]
         moving = _moving(channel.site.pointed("a beam"), grid) if timed else {}
-        views.append(View(part.channel, split, moments, waves, moving, seen, {}, part.precision, response, kernel))
+        views.append(View(part.channel, split, moments, waves, moving, seen, {}, {}, part.precision, response, kernel))
     scene = Scene(
         channels=model.channels,
         frequencies=tuple(channel.site.frequency_ghz for channel in model.survey.channels),
@@ -130,14 +130,14 @@ def with_chosen(model: Model, scene: Scene, kinds: Sequence[str]) -> Scene:
     """Return a scene that has waves of periods, or compact sources, besides: kinds of structures."""
     views, chosen = [], [Choice(kind, 0.0) for kind in kinds]
     for i, view in enumerate(scene.views):
-        waves, spots = dict(view.waves), dict(view.sources)
+        periods, spots = dict(view.periods), dict(view.sources)
         for one in chosen:
             if one.family == "period":
-                waves[one.kind] = _waves(model, i, {"wave": "period", "period_s": one.numbers[0]})
+                periods[one.kind] = _waves(model, i, {"wave": "period", "period_s": one.numbers[0]})
             else:
                 seen = alm_.multiply(sources.at(one.numbers, model.lmax), view.response, model.lmax)
                 spots[one.kind] = healpix.synthesis(seen[None], model.nside, model.lmax)[0]
-        views.append(replace(view, waves=waves, sources=spots))
+        views.append(replace(view, periods=periods, sources=spots))
     return replace(scene, views=tuple(views))
 
 
@@ -252,11 +252,13 @@ def scores_of_maps(model: Model, scene: Scene, maps: Sequence[Map]) -> Vector:
 def scores(job: Job) -> Matrix:
     """Return the scores of the simulations of a job, shape (count, P): the task that a worker runs.
 
-    Behind them stand the falls of chi^2 of peaks, if the job names no kinds.
+    Behind them stand the falls of chi^2 of peaks; if the job names kinds, the scores of these alone are returned.
     """
     model, scene = analysis_for(job).model, scene_for(job)
     filtered = (wiener_filter(model, maps) for maps in simulated_maps(job))
-    return np.stack([np.append(scene.values(one), [] if job.chosen else _falls(scene, one)) for one in filtered])
+    if job.chosen:
+        return np.stack([scene.chosen_values(one) for one in filtered])
+    return np.stack([np.append(scene.values(one), _falls(scene, one)) for one in filtered])
 
 
 def _falls(scene: Scene, filtered: FilteredMaps) -> list[float]:
@@ -302,7 +304,8 @@ def with_peaks(analysis: Analysis, scene: Scene, search: Search, maps: Sequence[
         return scene, search
     kinds = tuple(one.kind for one in chosen)
     more = with_chosen(analysis.model, scene, kinds)
-    return more, Search(structures(more), null_scores(analysis, ask, kinds), search.peaks)
+    simulations = np.concatenate([search.simulations, null_scores(analysis, ask, kinds)], axis=1)
+    return more, Search(structures(more), simulations, search.peaks)
 
 
 def _same(scene: Scene, one: Choice, other: Choice) -> bool:

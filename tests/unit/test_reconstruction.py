@@ -301,7 +301,7 @@ def test_a_period_that_stands_out_is_searched(monkeypatch):
 
     def null_scores(analysis, ask, chosen):
         asked.append(chosen)
-        return simulations
+        return np.random.default_rng(5).normal(size=(400, len(chosen) * len(scene.views) * 8))
 
     monkeypatch.setattr(simulated_scores, "null_scores", null_scores)
     search = Search(grammar(), simulations, np.random.default_rng(4).normal(size=(400, 4)) - 3.0)
@@ -311,12 +311,12 @@ def test_a_period_that_stands_out_is_searched(monkeypatch):
     period = 7321.0
     waves = simulated_scores.with_chosen(model, scene, [f"period {period!r}"])
     for i in (2, 3):
-        wave = waves.views[i].waves[f"period {period!r}"][0]
+        wave = waves.views[i].periods[f"period {period!r}"][0]
         maps[i] = maps[i] + 12.0 * wave / np.sqrt(np.sum(model.parts[i].precision * wave**2))
     more, wider = simulated_scores.with_peaks(analysis, scene, search, maps, None)
     found = asked[-1][0]  # the most evident; a gain may be told by side bands of the same wave
     assert abs(1.0 / float(found.removeprefix("period ")) - 1.0 / period) < 0.25 / scene.time_lines[1].duration_s
-    assert found in more.views[2].waves
+    assert found in more.views[2].periods
     words_ = [w for w in wider.grammar if w.kind == found]
     assert {w.channel for w in words_} == {"V1", "W1", None}
     assert all(w.tried == scene.time_lines[0].tried for w in words_)
