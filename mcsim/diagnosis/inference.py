@@ -28,20 +28,22 @@ from mcsim.support.numbers import measured
 
 def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     """Diagnose observed maps or measured spectra; raise InputError if they cannot be what they claim to be."""
-    context = data.context
-    data, refined = with_rivals(data, Refiner(data).run(data.templates(), context.candidates))
-    context, refiner = data.context, Refiner(data)
-    found, partial, reduction = refined.attribution.if_named(context.settings), refined.partial, None
+    refined = Refiner(data).run(data.templates(), data.context.candidates)
+    found, reduction = refined.attribution.if_named(data.context.settings), None
     exchanged = data.exchanged(found)
     notes, refusals = [*exchanged, *data.notes()], list[str]()
+    if not exchanged and found.explanations:
+        found, refusals = agreeing(data, refined, found)
+        if (beside := with_rivals(data, refined, found)) is not None:
+            data, refined = beside
+            found, refusals = agreeing(data, refined, refined.attribution.if_named(data.context.settings))
+    context, refiner, partial = data.context, Refiner(data), refined.partial
     if exchanged:
         # An order of the maps in which the model fits says more than any effect.
         found, partial = found.unexplained(), None
     elif found.explanations:
-        found, refusals = agreeing(data, refined, found)
-        if found.explanations:
-            found = _with_errors(data, refined, found)
-            found, reduction = confirmed(context, found, reduction_of(data, replace(refined, attribution=found)), notes)
+        found = _with_errors(data, refined, found)
+        found, reduction = confirmed(context, found, reduction_of(data, replace(refined, attribution=found)), notes)
         if why := unconfirmed(context, found, reduction is not None):
             refusals.append(why)
             found, reduction = found.unexplained(), None

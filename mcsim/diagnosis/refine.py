@@ -1,6 +1,6 @@
 """Simulate responses at the fitted amplitudes, where effects are too strong for a linear response."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -64,8 +64,8 @@ class Refiner:
         """Return the model, its simulations and templates."""
         return self.data.context
 
-    def run(self, t: Matrix, candidates: Sequence[Candidate]) -> Refined:
-        """Refine templates ``t``, shape (p, K), and the attribution.
+    def run(self, t: Matrix, candidates: Sequence[Candidate], sets: Sequence[tuple[int, ...]] = ()) -> Refined:
+        """Refine templates ``t``, shape (p, K), and the attribution; of ``sets`` all members, named or not.
 
         Notes
         -----
@@ -79,7 +79,8 @@ class Refiner:
         now = _Responses(t, t.copy(), list(candidates))
         found = self._attribute(now.t, now.candidates)
         for _ in range(self.context.settings.refine_rounds):
-            changed = [self._simulate(now, *work) for work in self._to_try(found, now.candidates)]
+            tried = [self._simulate(now, *part, curved=True) for part in self._of_sets(now, sets)]
+            changed = tried + [self._simulate(now, *part) for part in self._to_try(found, now.candidates)]
             if not any(changed):
                 break
             found = self._attribute(now.t, now.candidates)
@@ -100,6 +101,12 @@ class Refiner:
                 now, found, detected = beside, together, None
         return Refined(found, now.t, tuple(now.candidates), detected)
 
+    def _of_sets(self, now: "_Responses", sets: Sequence[tuple[int, ...]]) -> Iterator[tuple[int, Vector, Matrix]]:
+        """Yield the members of sets with their fitted coordinates."""
+        for members in sets:
+            fit = self.context.null.fit(self.data.x, now.t[:, columns_of(now.candidates, members)])
+            yield from parts_of(now.candidates, members, fit)
+
     def _completed(self, now: "_Responses", found: Attribution) -> Attribution:
         """Return the attribution once each member of its best sets has been simulated, at the fitted amplitude."""
         while best := found.explanations[:2]:
@@ -111,13 +118,18 @@ class Refiner:
             found = self._attribute(now.t, now.candidates)
         return found
 
-    def _simulate(self, now: "_Responses", index: int, coordinates: Vector, covariance: Matrix) -> bool:
-        """Simulate a candidate at fitted coordinates, and return True, unless it has been there."""
+    def _simulate(
+        self, now: "_Responses", index: int, coordinates: Vector, covariance: Matrix, curved: bool = False
+    ) -> bool:
+        """Simulate a candidate at fitted coordinates, and return True, unless it has been there.
+
+        ``curved``: its second derivative may matter, and is not known.
+        """
         candidate = now.candidates[index]
         columns, how, done = list(candidate.columns), candidate.parametrization, now.done.get(index)
         if candidate.nuisance or self._has_settled(done, coordinates, covariance):
             return False
-        nonlinear = how.nonlinear or self._is_nonlinear(columns, coordinates)
+        nonlinear = curved or how.nonlinear or self._is_nonlinear(columns, coordinates)
         stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
         if (stochastic or nonlinear) and done is not None:
             share = self._squared(now.linear[:, columns], now.t[:, columns], done)

@@ -12,35 +12,44 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.naming import slices_of
 from mcsim.diagnosis.refine import Refined, Refiner
+from mcsim.diagnosis.selection import Attribution
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 
 
-def with_rivals(data: DataSet[Any], refined: Refined) -> tuple[DataSet[Any], Refined]:
-    """Return data and attribution with the effects on request that explain the data like the only set that is named.
+def with_rivals(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[DataSet[Any], Refined] | None:
+    """Return data and attribution with the effects on request that explain the data like the only set to be named.
+
+    None if there are several sets, or no such effects.
 
     Notes
     -----
     As a candidate each of them would raise the bar for all. Here it becomes a candidate for these data alone, and only
     if it can take the place of a member, in the data vector and in the numbers beside it. Global p-values stay those of
-    the candidates that are always proposed. Patterns that are drawn are no rivals.
+    the candidates that are always proposed. It is simulated at the amplitude that it has there, as a member was.
+    Patterns that are drawn are no rivals.
     """
-    context, found = data.context, refined.attribution.if_named(data.context.settings)
+    context = data.context
     if len(found.explanations) != 1:
-        return data, refined
+        return None
     channels = {context.candidates[member].channel for member in found.explanations[0].members}
     others = [one for one in on_request(context.analysis) if not one.random_response]
     near = [one for one in others if one.channel in channels or None in (one.channel, *channels)]
     known = list(data.responses(near, context.settings.channel_skies))
     null, z, t = _widest(data, refined, found.explanations[0].members)
     wide = replace(refined, attribution=found, templates=t)
-    rivals = [known[place] for place in in_place(null, z, wide, known, context.settings)]
-    if not rivals:
-        return data, refined
-    data = replace(data, context=with_candidates(context, rivals))
+    places = list(in_place(null, z, wide, known, context.settings))
+    if not places:
+        return None
+    data = replace(data, context=with_candidates(context, [known[rival] for rival, _ in places]))
     added = data.context.templates[:, context.templates.shape[1] :]
     candidates = (*refined.candidates, *data.context.candidates[len(context.candidates) :])
-    return data, Refiner(data).run(np.concatenate([refined.templates, added], axis=1), candidates)
+    members = found.explanations[0].members
+    sets = [
+        (*(one for one in members if one != member), len(context.candidates) + k)
+        for k, (_, member) in enumerate(places)
+    ]
+    return data, Refiner(data).run(np.concatenate([refined.templates, added], axis=1), candidates, sets)
 
 
 def _widest(data: DataSet[Any], refined: Refined, members: Sequence[int]) -> tuple[SimulatedGaussian, Vector, Matrix]:
@@ -62,8 +71,10 @@ def in_place(
     refined: Refined,
     rivals: Sequence[tuple[Candidate, Matrix]],
     settings: DiagnosisSettings,
-) -> Iterator[int]:
+) -> Iterator[tuple[int, int]]:
     """Yield the indices of rivals, with their responses, that explain data in the place of a member of the only set.
+
+    With each stands the member.
 
     Amplitudes are possible, and the likelihood is within ``odds_cut`` of that of the set, but for an error of the
     response that is tolerated (``consistency_error``). Data and templates are those of ``null``.
@@ -80,7 +91,7 @@ def in_place(
             fit = null.fit(z, t[:, columns])
             wrong = settings.consistency_error * null.expected_snr(t[:, columns] @ fit.amplitudes)
             if null.log_likelihood(fit.chi2) + 0.5 * wrong**2 >= least and np.isfinite(beyond(every, changed, fit)):
-                yield index
+                yield index, member
                 break
 
 

@@ -66,12 +66,12 @@ class Instrument:
     def scatter(self, changes: np.ndarray) -> np.ndarray:
         return (changes - changes.mean(axis=0)).T / np.sqrt(len(changes) - 1.0)
 
-    def refined(self, x: np.ndarray):
+    def refined(self, x: np.ndarray, sets=()):
         bank = SimpleNamespace(curvature=self.curvature)
         context = SimpleNamespace(null=self.null, calibration=self.calibration, bank=bank, settings=DiagnosisSettings())
         own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter}
         data = SimpleNamespace(context=context, x=x, realizations=1, **own)
-        return Refiner(data).run(self.t, self.candidates)
+        return Refiner(data).run(self.t, self.candidates, sets)
 
 
 @pytest.mark.parametrize("amplitude", [15.0, -15.0])
@@ -83,6 +83,17 @@ def test_a_bent_response_is_found_at_its_amplitude(amplitude):
     found = instrument.refined(x).attribution
     assert [explanation.members for explanation in found.explanations] == [(0,)]
     assert found.explanations[0].fit.amplitudes == pytest.approx([amplitude], abs=0.3)
+
+
+def test_a_rival_is_simulated_at_its_amplitude_though_another_is_named():
+    """A is bent, which its templates do not know; C has the straight response that A has at this amplitude."""
+    instrument = Instrument(bend=0.04, cross=0.0)
+    instrument.curvature = np.zeros_like(instrument.curvature)
+    x = instrument.response(15.0, 0.0)
+    instrument.t[:, 2] = x / np.linalg.norm(x)
+    assert [one.members for one in instrument.refined(x).attribution.explanations] == [(2,)]
+    found = instrument.refined(x, sets=[(0,)]).attribution
+    assert {one.members for one in found.explanations} == {(0,), (2,)}
 
 
 def test_secants_of_a_power_do_not_swing_about_the_amplitude():

@@ -285,7 +285,7 @@ def true(number):
                 named, counted = found, [*counted, *row]
                 if len(found.explanations) == 1:
                     refined = Refined(found, t, known.candidates)
-                    if near := [rivals[index] for index in in_place(null, seen, refined, rivals, known.settings)]:
+                    if near := [rivals[index] for index, _ in in_place(null, seen, refined, rivals, known.settings)]:
                         more = with_candidates(known, near)
                         named = attribute(more.null, x, more.templates, more.candidates, more.calibration)
                         counted[-4:] = said(named.if_named(more.settings), more, member.identity)
