@@ -229,30 +229,34 @@ def summary(files):
         both = [one[2] <= 0.05 and bool(one[3]) for one in nulls]
         print(told(share("maps of the model with a gap and a structure", both)))
         print(told(share("of those with a gap, with a structure", [bool(one[3]) for one in gaps])))
-    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
-    panels = figure.subplots(1, 2, sharey=True)
-    titles = {"library": "effects of the library, left out", "foreign": "systematics of no library"}
-    for axes, (group, title) in zip(panels, titles.items(), strict=True):
-        own = [one for one in rows if one[0] == group]
-        for place, strength in enumerate(sorted({one[3] for one in own})):
+    titles = {
+        "library": "effects of the library, left out",
+        "foreign": "systematics of no library",
+        "further": "of published error budgets",
+    }
+    drawn = {group: own for group in titles if (own := [one for one in rows if one[0] == group])}
+    if not drawn:
+        return
+    figure = Figure(figsize=(4.0 * len(drawn), 3.2), layout="constrained")
+    panels = figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0]
+    for axes, (group, own) in zip(panels, drawn.items(), strict=True):
+        strengths = sorted({one[3] for one in own})
+        for place, strength in enumerate(strengths):
             cases = [one for one in own if one[3] == strength]
             shares = [share(word, [right(one, word) for one in cases]) for word in (*WORDS, "all")]
             values = np.array([[one.value, one.value - one.low, one.high - one.value] for one in shares]).T
-            where = np.arange(len(shares)) + 0.2 * (place - 1)
+            where = np.arange(len(shares)) + 0.2 * (place - 0.5 * (len(strengths) - 1))
             label = f"S/N {strength:.0f}, {len(cases)} cases"
             axes.errorbar(where, values[0], np.maximum(values[1:], 0.0), fmt="o", markersize=4, capsize=2, label=label)
             print(group, f"S/N {strength:.0f}", *map(told, shares), sep="\n    ")
         axes.axhline(0.8, color="black", linestyle=":", linewidth=0.8)
         axes.set_xticks(range(len(WORDS) + 1), [*WORDS, "all"])
         axes.set_ylim(0.0, 1.03)
-        axes.set_title(title, fontsize=10)
-        if own:
-            axes.legend(frameon=False, fontsize=8, loc="lower left")
-            report(group, own)
+        axes.set_title(titles[group], fontsize=10)
+        axes.legend(frameon=False, fontsize=8, loc="lower left")
+        report(group, own)
     panels[0].set_ylabel("share of cases that are right")
     figure.savefig(PICTURE, dpi=120)
-    if own := [one for one in rows if one[0] == "further"]:
-        report("further", own)
 
 
 def report(group, own):
