@@ -18,7 +18,7 @@ from mcsim.datavector.analysis import analysis_of, data_vectors, on_request
 from mcsim.datavector.campaign import with_effects
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import shared_sky, wiener_filter
-from mcsim.diagnosis import api, report, unlisted, words
+from mcsim.diagnosis import api, inference, report, unlisted, words
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
@@ -347,6 +347,16 @@ def test_an_effect_on_request_is_named_beside_what_it_cannot_be_told_from(small,
     assert sorted(named) == sorted([(one, "W1")] for one in [name, *rivals])
     assert found.kind == ("degenerate" if rivals else "effect")
     assert len(found.candidates) == len(small.candidates) + len(rivals)
+
+
+def test_rivals_are_sought_of_what_the_data_leave_to_be_named(small, monkeypatch):
+    """Of several sets one may be left alone when the others fall away."""
+    left, asked, agreeing = [], [], inference.agreeing
+    monkeypatch.setattr(inference, "agreeing", lambda *own: left.append(agreeing(*own)) or left[-1])
+    monkeypatch.setattr(inference, "with_rivals", lambda data, refined, found: asked.append(found))
+    shared = data_of(small.run, "beam_ellipticity", "W1", amplitude=0.25)
+    diagnose_data(ObservedMaps(small, list(simulate.maps(shared, 1)), ask), "ellipticity")
+    assert [id(one) for one in asked] == [id(found) for found, _ in left]
 
 
 def test_the_cost_of_a_diagnosis_counts_the_effects_on_request(small):
