@@ -46,6 +46,9 @@ MOTION = "motion"  #: kind of a rotation that turns with the Sun, as aberration 
 
 MEANS = ("monopole", "constant", "level")  #: kinds that are the mean of others: in time, on the sky, of noise
 
+IN_MAPS = ("beam", "elsewhere", "noise", "square", "cube", "rotation")
+"""Stages that no effect of the simulator has in one split: simulated by that of all splits, in some maps."""
+
 ANY = f"1-{HARMONICS}"  #: of a wave in any way: a constant and all harmonics
 
 ALSO_COMMON = ("monopole", "dipole", "degrees 0-1")
@@ -130,7 +133,7 @@ class Structure:
     def by_map(self) -> bool:
         """Return True if, where it differs between splits, it is that of all splits in some maps."""
         patterned = self.stage == "gain" and self.frame == "sky"
-        return patterned or self.kind.startswith("source") or self.stage in _IN_MAPS
+        return patterned or self.kind.startswith("source") or self.stage in IN_MAPS
 
     @property
     def by_coordinate(self) -> bool:
@@ -160,9 +163,6 @@ class Structure:
         return Structure(
             *self.says, self.rows[:, kept], self.weights[kept], self.mix, tuple(self.views[k] for k in kept), self.tried
         )
-
-
-_IN_MAPS = ("beam", "elsewhere", "noise", "square", "cube", "rotation")
 
 
 def _briefly(kind: str) -> list[str]:

@@ -131,10 +131,10 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             return "Elsewhere", {"factor": float(theta[0]), "top": ELSEWHERE, **acting}
         case "gain", _ if not alike:
             value = float(theta[0]) / (1.0 if structure.acts_on == "dipole" else CONSTANT)
-            acting = {"coefficients": (value,)} if structure.kind == "constant" else {"wave": "sky", **timed}
+            timed |= {"coefficients": (value,)} if structure.kind == "constant" else {"wave": "sky"}
             if structure.acts_on == "sky and dipole":
-                return "GainOverTime", {**acting, **splits}
-            return "GainOfOne", {"on_sky": structure.acts_on == "sky", **acting, **splits}
+                return "GainOverTime", timed
+            return "GainOfOne", {"on_sky": structure.acts_on == "sky", **timed}
         case "gain", _:
             one = (float(theta[0]) * CONSTANT,) if structure.acts_on == "dipole" else pattern
             acting = {"on_sky": "sky" in structure.acts_on, "on_dipole": "dipole" in structure.acts_on}
