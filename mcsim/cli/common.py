@@ -43,7 +43,7 @@ Including = Annotated[
     list[str] | None,
     Option("--with", metavar="EFFECT", help="Propose an effect on request, or of FILE.py; repeatable."),
 ]
-Simulations = Annotated[int | None, Option(min=50, help="For a sample covariance; default: five per element, shrunk.")]
+Simulations = Annotated[int | None, Option(min=50, help="For a sample covariance; default: three per element, shrunk.")]
 Processes = Annotated[int | None, Option(min=1, help="Local processes; default: the configuration's.")]
 Scheduler = Annotated[str | None, Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port.")]
 Part = Annotated[str | None, Option(metavar="A:B", help="Only realizations A to B - 1; default: all.")]

@@ -17,6 +17,7 @@ from mcsim.datavector.bipolar_scan import rms
 from mcsim.datavector.candidate import Candidate, TemplateBank
 from mcsim.datavector.kept import Kept
 from mcsim.datavector.null_ensemble import NullEnsemble, without_nuisances
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.ensemble import runner
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
@@ -108,12 +109,12 @@ class Purpose(NamedTuple):
 def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool = True) -> dict[Purpose, Job]:
     """Return all jobs from which :func:`learned` estimates null ensemble and templates.
 
-    ``simulations`` for the covariance are by default ``settings.sims_per_element`` for every element of the data
-    vector, or what is stored of an external ensemble. The default route is compared with the time-ordered reference if
+    ``simulations`` for the covariance are by default what every element of the data vector needs (:func:`_needed`), or
+    what is stored of an external ensemble. The default route is compared with the time-ordered reference if
     that is wanted, and every channel's pointing is known.
     """
     settings, run = analysis.settings, analysis.run
-    wanted = settings.sims_per_element * len(analysis.elements) if simulations is None else simulations
+    wanted = _needed(settings, len(analysis.elements)) if simulations is None else simulations
     if analysis.source is not None and analysis.source.count is not None:
         wanted = min(wanted, analysis.source.count)
     base = seeded(run, _RESPONSE)
@@ -262,11 +263,16 @@ def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool
     drawn = np.concatenate([result[:, :size] for purpose, result in first.items() if purpose.kind == "null"])
     quiet = without_nuisances(drawn, _nuisances(analysis, len(drawn)))
     independent = SimulatedGaussian.from_simulations(quiet, floor=settings.redundant).dimension
-    enough = settings.sims_per_element * independent
-    if source is not None and source.count is not None and source.count < enough:
+    enough = _needed(settings, independent)
+    if source is not None and source.count is not None and source.count < settings.sims_per_element * independent:
         raise _too_few(source, independent, settings.sims_per_element)
     found = first | run([one for one in jobs if one not in first and (one.kind != "null" or one.number < enough)])
     return {purpose: found[purpose] for purpose in jobs if purpose in found}
+
+
+def _needed(settings: DiagnosisSettings, elements: int) -> int:
+    """Return the number of simulations that a covariance of so many elements, and the bipolar scan, need."""
+    return max(settings.sims_per_element * elements, settings.scan_sims)
 
 
 def _too_few(source: Source, independent: int, each: int) -> InputError:

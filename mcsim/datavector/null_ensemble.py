@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from mcsim.datavector.candidate import Column, TemplateBank
-from mcsim.datavector.summaries import Element
+from mcsim.datavector.summaries import Element, pair_classes
 from mcsim.ensemble.store import write_dataset
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector, divided
@@ -63,7 +63,8 @@ class NullEnsemble:
     def _of_one(self) -> SimulatedGaussian:
         """Return the Gaussian for data of a single sky."""
         if self.nuisances is None:
-            return SimulatedGaussian.from_simulations(self.simulations, self.offset, self.redundant, self.shrunk)
+            alike = pair_classes(self.elements) if self.shrunk else None
+            return SimulatedGaussian.from_simulations(self.simulations, self.offset, self.redundant, self.shrunk, alike)
         tested = self.tested
         kept = SimulatedGaussian.from_simulations(self.quiet[:, tested], floor=self.redundant).whitening
         wide = SimulatedGaussian.from_simulations(self.simulations[:, tested] @ kept.T, floor=ROUND_OFF)

@@ -8,7 +8,7 @@ from mcsim.support.settings import check_settings
 from mcsim.systematics import Library
 
 _FIRST = {
-    "sims_per_element": 3,
+    "sims_per_element": 2,
     "pilot_sims_per_element": 2,
     "channel_skies": 2,
     "typical_skies": 3,
@@ -82,7 +82,8 @@ class DiagnosisSettings:
     place_pvalue
         P-value up to which a group of numbers is listed before others of a kind listed already.
     sims_per_element, pilot_sims_per_element
-        Simulations per independent element of the data vector; and per element, after which these are counted.
+        Simulations per independent element of the data vector, at least ``scan_sims`` in all; and per element, after
+        which these are counted.
     shrunk
         Shrink the covariance (:func:`mcsim.stats.shrinkage.shrunk`), unless ``simulations`` is given. That of a sample
         needs 10 per element.
@@ -172,7 +173,7 @@ class DiagnosisSettings:
     Ask for a first verdict from fewer simulations:
 
     >>> mcsim.DiagnosisSettings.quick(without=("beam_ellipticity",)).sims_per_element
-    3
+    2
     """
 
     without: tuple[str, ...] = ()
@@ -202,8 +203,8 @@ class DiagnosisSettings:
     slice_snr: float = 2.0
     place_pvalue: float = 0.01
 
-    sims_per_element: int = 5
-    pilot_sims_per_element: int = 3
+    sims_per_element: int = 3
+    pilot_sims_per_element: int = 2
     shrunk: bool = True
     redundant: float = 1e-4
     response_modes: int = 1 << 14

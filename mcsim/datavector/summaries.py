@@ -1,11 +1,12 @@
 """The data vector: a short vector of summary statistics, each with a description."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
 
 import healpy
 import numpy as np
+from numpy.typing import NDArray
 
 from mcsim.bipolar import by_degree
 from mcsim.datavector.wiener_filter import FilteredMaps, Model
@@ -50,6 +51,27 @@ class Element:
         degrees = "" if self.ell is None else f"ℓ {self.ell[0]}" + f"–{self.ell[1]}" * (self.ell[1] > self.ell[0])
         whose = () if self.effect is not None else (", ".join(self.channels), self.split)
         return ", ".join(filter(None, (self.family, *whose, degrees, self.component)))
+
+
+def pair_classes(elements: Sequence[Element]) -> NDArray[np.int64]:
+    """Return the number of the class of each pair of elements, shape (p, p), the same for pairs that are alike.
+
+    They measure the same two things, in one channel or in two, in one split or in two, whichever these are.
+    """
+    kinds: dict[tuple[Element, int], int] = {}
+    met: dict[tuple[Element, tuple[str, ...], str | None], int] = {}
+    kind = np.zeros(len(elements), dtype=np.int64)
+    for i, element in enumerate(elements):
+        what = replace(element, name="", channels=(), split=None, fold=None, effect=None)
+        whose = (what, element.channels, element.split)
+        met[whose] = met.get(whose, 0) + 1
+        kind[i] = kinds.setdefault((what, met[whose]), len(kinds))
+    channels = sorted({channel for element in elements for channel in element.channels})
+    seen = np.array([[channel in element.channels for channel in channels] for element in elements], dtype=np.int64)
+    split = np.array([str(element.split) for element in elements])
+    low, high = np.minimum.outer(kind, kind), np.maximum.outer(kind, kind)
+    classes = (low * len(kinds) + high) * (len(channels) + 1) + seen @ seen.T
+    return np.asarray(2 * classes + (split[:, None] == split))
 
 
 KINDS = {

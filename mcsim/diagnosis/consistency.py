@@ -23,7 +23,7 @@ LARGE = 12  #: highest degree of the largest scales
 
 FRAMES = ("ecliptic", "galactic", "equatorial")
 
-SPARE, SPARE_SHRUNK = 2.0, 1.5  #: simulations per element that a comparison needs; with a shrunk covariance
+SPARE, SPARE_SHRUNK = 2.0, 1.25  #: simulations per element that a comparison needs; with a shrunk covariance
 
 
 @dataclass(frozen=True)

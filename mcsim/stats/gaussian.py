@@ -93,13 +93,14 @@ class SimulatedGaussian:
         offset: NDArray[np.float64] | None = None,
         floor: float = 1e-8,
         shrink: bool = False,
+        classes: NDArray[np.int64] | None = None,
     ) -> "SimulatedGaussian":
         """Estimate mean and covariance from simulations, shape (N, p_raw).
 
         ``offset``: known difference between the mean of the data and that of the simulations, shape (p_raw,).
         Eigenvalues of the correlation matrix below the fraction ``floor`` of the largest are left out. ``shrink``: a
-        covariance from few simulations (:func:`mcsim.stats.shrinkage.shrunk`). Raise InputError if an element is not
-        finite or constant, or there are fewer than p + 7 simulations.
+        covariance from few simulations (:func:`mcsim.stats.shrinkage.shrunk`, also for ``classes``). Raise InputError
+        if an element is not finite or constant, or there are fewer than p + 7 simulations.
         """
         mean = simulations.mean(axis=0)
         centred = simulations - mean
@@ -117,7 +118,7 @@ class SimulatedGaussian:
             )
         centre = mean if offset is None else mean + offset
         if shrink:
-            found = shrunk(simulations, floor)
+            found = shrunk(simulations, floor, classes)
             null = cls(centre, found.whitening, count, covariance_dof=found.dof, folds=found.folds)
         else:
             null = cls(centre, np.sqrt(count - 1.0) * right[kept] / singular[kept, None] / scale, count)

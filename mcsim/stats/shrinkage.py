@@ -3,15 +3,17 @@
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcsim.support.arrays import Matrix, Vector
 
-SIGNIFICANT = 4.0  #: standard errors of a correlation from which on it is a part of the target
+WIDTHS = np.concatenate([[0.0], np.geomspace(0.02, 0.6, 7)])  #: of the normal distributions of true correlations
+ROUNDS = 60  #: in which the shares of these distributions are found
 
 LEAST = 0.5
-"""Smallest eigenvalue of the target over that of the sample correlation: a target cut to zeros may have none."""
+"""Smallest eigenvalue of the target over that of the sample correlation: a target found pair by pair may have none."""
 
-FOLDS = 10
+FOLDS = 20
 LARGEST = 1_000_000  #: degrees of freedom of a covariance that is as good as known
 
 
@@ -37,10 +39,12 @@ class Shrunk(NamedTuple):
     folds: tuple[Fold, ...]
 
 
-def shrunk(simulations: Matrix, floor: float) -> Shrunk:
+def shrunk(simulations: Matrix, floor: float, classes: NDArray[np.int64] | None = None) -> Shrunk:
     """Return a shrunk covariance of simulations, shape (N, p_raw), N > p, with its worth.
 
-    ``floor``: eigenvalues of the correlation matrix below this fraction of the largest are left out.
+    ``floor``: eigenvalues of the correlation matrix below this fraction of the largest are left out. ``classes``: the
+    number of a class for each pair of elements, shape (p_raw, p_raw); correlations of one class are expected to be
+    similar. None: nothing is known of them.
 
     Notes
     -----
@@ -54,13 +58,13 @@ def shrunk(simulations: Matrix, floor: float) -> Shrunk:
     z = simulations / spread
     values, vectors = np.linalg.eigh(np.corrcoef(z.T))
     basis = vectors[:, values > floor * values[-1]].T
-    whitening, folds = _whitening(z, basis), []
+    whitening, folds = _whitening(z, basis, classes), []
     p, count, back = len(whitening), len(simulations), np.linalg.pinv(whitening)
     total, products, pairs = 0.0, 0.0, 0
     for number in range(FOLDS):
         out = np.arange(count) % FOLDS == number
         rest = z[~out]
-        own = _whitening(rest, basis)
+        own = _whitening(rest, basis, classes)
         white = (z[out] - rest.mean(axis=0)) @ own.T / np.sqrt(1.0 + 1.0 / len(rest))
         gram = white @ white.T
         total += float(np.trace(gram))
@@ -73,24 +77,56 @@ def shrunk(simulations: Matrix, floor: float) -> Shrunk:
     return Shrunk(scale * whitening / spread, dof, tuple(Fold(scale * one.white, one.turn) for one in folds))
 
 
-def _whitening(z: Matrix, basis: Matrix) -> Matrix:
+def _whitening(z: Matrix, basis: Matrix, classes: NDArray[np.int64] | None) -> Matrix:
     """Return coordinates in which the shrunk covariance is one, shape (p, p_raw).
 
     ``z``: simulations of unit variance, shape (N, p_raw); ``basis``: directions that are not redundant, (p, p_raw).
 
     Notes
     -----
-    Most elements are hardly correlated. The target has the correlations that are significant, the others zero; in
-    coordinates in which the target is one, eigenvalues are shrunk by the formula of Ledoit & Wolf.
+    In coordinates in which the target is one, eigenvalues are shrunk by the formula of Ledoit & Wolf.
     """
     n, centred = len(z) - 1, z - z.mean(axis=0)
     sample = centred.T @ centred / n
     smallest = float(np.linalg.eigvalsh(basis @ sample @ basis.T)[0])
-    target = np.where(np.abs(sample) >= SIGNIFICANT / np.sqrt(n), sample, 0.0)
-    values, vectors = np.linalg.eigh(basis @ target @ basis.T)
+    values, vectors = np.linalg.eigh(basis @ _target(sample, n, classes) @ basis.T)
     first = (vectors / np.sqrt(np.maximum(values, LEAST * smallest))).T @ basis
     values, vectors = np.linalg.eigh(first @ sample @ first.T)
     return np.asarray((vectors / np.sqrt(shrunk_eigenvalues(values, n))).T @ first)
+
+
+def _target(sample: Matrix, n: int, classes: NDArray[np.int64] | None) -> Matrix:
+    """Return what the true correlations are expected to be, one by one, given the sample ones, shape (p_raw, p_raw).
+
+    The mean of each class is estimated, and the departure of each correlation from it.
+    """
+    pairs = np.tril_indices(len(sample), -1)
+    found, expected = sample[pairs], np.zeros(len(pairs[0]))
+    if classes is not None:
+        _, which, count = np.unique(classes[pairs], return_inverse=True, return_counts=True)
+        means = np.bincount(which, found) / count
+        expected = posterior_means(means, 1.0 / np.sqrt(n * count))[which]
+    target = np.diag(np.diag(sample))
+    target[pairs] = expected + posterior_means(found - expected, np.full(len(found), 1.0 / np.sqrt(n)))
+    return np.asarray(np.tril(target) + np.tril(target, -1).T)
+
+
+def posterior_means(values: Vector, errors: Vector) -> Vector:
+    """Return the expected true values, given measured ones and their errors, shape (count,).
+
+    Notes
+    -----
+    Empirical Bayes (Stephens, Biostatistics 18, 275, 2017): true values are zero, or of a normal distribution of one of
+    the :data:`WIDTHS`; the shares of these are those of largest likelihood (expectation and maximisation).
+    """
+    variance = errors**2 + WIDTHS[:, None] ** 2
+    likelihood = np.exp(-0.5 * values**2 / variance) / np.sqrt(variance)
+    shares = np.full(len(WIDTHS), 1.0 / len(WIDTHS))
+    for _ in range(ROUNDS):
+        weights = shares[:, None] * likelihood
+        weights /= weights.sum(axis=0)
+        shares = weights.mean(axis=1)
+    return np.asarray(values * np.sum(weights * WIDTHS[:, None] ** 2 / variance, axis=0))
 
 
 def shrunk_eigenvalues(values: Vector, n: int) -> Vector:

@@ -47,7 +47,7 @@ EXAMPLE = Path(__file__).parents[2] / "docs" / "howto" / "own_simulator.toml"
 LIBRARY = {name: kind for name, kind in mcsim.effects().items() if name in ("beam_width", "noise_level")}
 SMALL = {"beam_orders": 1, "split_beam_orders": 1, "sky_bins": 4, "scan_L_max": 1, "scan_bins": 1, "scan_sims": 20}
 SMALL |= {"noisy_skies": 12, "constrained_skies": 4}
-SETTINGS = mcsim.DiagnosisSettings(library=LIBRARY, sims_per_element=5, **SMALL)
+SETTINGS = mcsim.DiagnosisSettings(library=LIBRARY, **SMALL)
 
 FEW = replace(SETTINGS, simulations=80)
 
@@ -378,7 +378,7 @@ def test_what_cannot_be_a_simulator(tmp_path, monkeypatch):
 
 def test_small_ensembles_are_refused_with_the_number_that_is_needed(tmp_path):
     stack = native(1, 60)
-    with refused("60", "315", "5", "--without"):
+    with refused("60", "189", "3", "--without"):
         mcsim.diagnose(mcsim.ExternalModel(MODEL, stack), list(stack[0]), settings=SETTINGS)
     with refused("200", "60"):
         few = replace(SETTINGS, simulations=200)

@@ -31,7 +31,7 @@ MODEL = {
 }
 LIBRARY = {name: kind for name, kind in mcsim.effects().items() if name in ("beam_width", "noise_level")}
 SMALL = {"beam_orders": 1, "split_beam_orders": 1, "sky_bins": 4, "scan_L_max": 1, "scan_bins": 1, "scan_sims": 20}
-SETTINGS = mcsim.DiagnosisSettings(library=LIBRARY, sims_per_element=5, **SMALL)
+SETTINGS = mcsim.DiagnosisSettings(library=LIBRARY, **SMALL)
 
 
 class Killed(BaseException):
@@ -110,7 +110,7 @@ def test_a_first_verdict_is_followed_by_the_whole_one_without_another_simulation
 
 
 def test_with_nuisances_a_first_verdict_has_the_simulations_of_a_sample_covariance():
-    assert mcsim.DiagnosisSettings.quick().without_shrinkage().sims_per_element == SETTINGS.sims_per_element * 2
+    assert mcsim.DiagnosisSettings.quick().without_shrinkage().sims_per_element == 10
     assert mcsim.DiagnosisSettings.quick(sims_per_element=7).without_shrinkage().sims_per_element == 7
     assert not mcsim.DiagnosisSettings.quick().without_shrinkage().shrunk
 

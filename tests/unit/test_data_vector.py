@@ -7,7 +7,7 @@ from instruments import two_channels
 from mcsim import config
 from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.summaries import ranges_within
+from mcsim.datavector.summaries import Element, pair_classes, ranges_within
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.systematics import catalogue
@@ -49,3 +49,36 @@ def test_of_more_ranges_than_asked_for_those_of_the_fewest_modes_are_joined() ->
 
 def test_no_range_is_less_than_a_degree() -> None:
     assert ranges_within((2, 4), 9) == [(2, 2), (3, 3)]
+
+
+def test_pairs_are_of_one_class_whichever_channels_and_splits_they_are_of():
+    def of(channel, split, order, low):
+        name = f"{channel}{split}{order}{low}"
+        return Element(name, "map", (channel,), split, ell=(low, low + 9), L=order, kind="beam")
+
+    maps = [(channel, split) for channel in ("V1", "W1", "W2") for split in ("half1", "half2")]
+    elements = [of(*one, order, low) for one in maps for order in (0, 1) for low in (2, 12)]
+    # Two numbers of one channel that have all but their names in common: the first of each map is like the first.
+    both = [(channel, letter) for channel in ("V1", "W1") for letter in "ab"]
+    elements += [Element(one + letter, "score", (one,), candidate="gain", kind="matched") for one, letter in both]
+    elements.append(Element("sky", "cl", ("V1", "W1", "W2"), kind="sky"))
+    place = {element.name: number for number, element in enumerate(elements)}
+    classes = pair_classes(elements)
+
+    def same(*pairs):
+        return len({int(classes[place[one], place[other]]) for one, other in pairs}) == 1
+
+    assert np.array_equal(classes, classes.T)
+    assert same(("V1half102", "W1half112"), ("W1half102", "V1half112"), ("W2half212", "W1half202"))  # orders 0 and 1
+    assert same(("V1half102", "V1half112"), ("W2half202", "W2half212"))
+    assert same(("V1half102", "V1half202"), ("W1half102", "W1half202"))
+    assert same(("V1half102", "sky"), ("W2half202", "sky"))
+    assert same(("V1a", "W1b"), ("V1b", "W1a"))
+    for one, other in (
+        ("V1half112", "W1half112"),  # the same channel or another one
+        ("W1half202", "V1half112"),  # the same split or another one
+        ("W1half1012", "V1half112"),  # another range of degrees
+        ("W1half102", "W1half202"),  # another order
+    ):
+        assert not same(("V1half102", "V1half112"), (one, other))
+    assert not same(("V1a", "W1a"), ("V1a", "W1b"))

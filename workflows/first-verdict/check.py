@@ -13,6 +13,7 @@ from scipy.stats import kstest
 
 from mcsim.datavector.null_ensemble import load
 from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.summaries import pair_classes
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate, calibrate_in_folds
 
@@ -25,8 +26,9 @@ DRAWN = 100
 class Judge:
     """Test data against simulations: gap p-value with all candidates."""
 
-    def __init__(self, simulations, templates, groups, floor, shrink):
-        self.null = SimulatedGaussian.from_simulations(simulations, floor=floor, shrink=shrink)
+    def __init__(self, simulations, templates, groups, floor, classes=None):
+        shrink = classes is not None
+        self.null = SimulatedGaussian.from_simulations(simulations, floor=floor, shrink=shrink, classes=classes)
         self.groups = self.null.whiten_groups(templates, groups)
         self.calibration = calibrate(self.null, self.groups, draws=4000)
         if shrink:
@@ -64,7 +66,7 @@ def drawn(ensemble, templates, groups, few, rounds):
     found, powers = {"omnibus": [], "gap": []}, []
     for _ in range(rounds):
         simulations, tested = (rng.standard_normal((count, root.shape[1])) @ root.T for count in (few, DRAWN))
-        judge = Judge(simulations, templates, groups, ensemble.redundant, shrink=True)
+        judge = Judge(simulations, templates, groups, ensemble.redundant, pair_classes(ensemble.elements))
         powers.append(judge.calibration.power)
         for name, values in zip(found, judge.pvalues(tested), strict=True):
             found[name] += values.tolist()
@@ -76,7 +78,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("store", type=Path)
     parser.add_argument("--rounds", type=int, default=130)
-    parser.add_argument("--each", type=int, default=3, help="simulations per element")
+    parser.add_argument("--each", type=float, default=3, help="simulations per element")
     parser.add_argument("--drawn", action="store_true", help="Gaussian draws in place of simulations")
     given = parser.parse_args()
     ensemble, bank = load(given.store)
@@ -90,7 +92,7 @@ def main():
     columns = [column for group in groups for column in group]
     whole = SimulatedGaussian.from_simulations(x, floor=floor)
     p, rng = whole.dimension, np.random.default_rng(1)
-    few = given.each * p
+    few, classes = round(given.each * p), pair_classes(ensemble.elements)
     if given.drawn:
         drawn(ensemble, templates, groups, few, given.rounds)
         return
@@ -101,8 +103,8 @@ def main():
     for _ in range(given.rounds):
         order = rng.permutation(len(x))
         tested, rest = x[order[:TESTED]], x[order[TESTED:]]
-        shrunk = Judge(rest[:few], templates, groups, floor, shrink=True)
-        sample = Judge(rest, templates, groups, floor, shrink=False)
+        shrunk = Judge(rest[:few], templates, groups, floor, classes)
+        sample = Judge(rest, templates, groups, floor)
         for name, values in zip(found, shrunk.pvalues(tested), strict=True):
             found[name] += values.tolist()
         column = rng.choice(columns, TESTED)
