@@ -42,6 +42,7 @@ def result_of(
         faint=found.faint,
         probability=found.probability,
         cosine=found.cosine,
+        nearest_pvalue=found.singles[found.nearest].pvalue,
         partial=() if partial is None else tuple(effects_of(candidates, partial.members, partial.fit)),
         partial_left=None if partial is None else partial.left,
         held_out=reduction,

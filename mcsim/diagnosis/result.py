@@ -139,8 +139,9 @@ class DiagnosisResult:
         Test of the whole data vector; with few simulations its chi^2 is too large on average, and ``excess`` is not.
     sets, contrasts
         Sets of effects that describe the data, the most probable first, and what would tell them apart.
-    nearest, cosine
-        Index of the candidate that lowers chi^2 most, and the cosine between its best fit and the departure.
+    nearest, cosine, nearest_pvalue
+        Index of the candidate that lowers chi^2 most, the cosine between its best fit and the departure, and the
+        p-value of what this fit leaves; None in results of version 0.1.
     partial, partial_left
         Effects that are detected where no set describes the data, and the fraction of the excess chi^2 that they leave.
     held_out
@@ -223,6 +224,7 @@ class DiagnosisResult:
     unlisted: tuple[Reconstructed, ...] | None = None
     unlisted_held_out: HeldOut | None = None
     untested: tuple[str, ...] = ()
+    nearest_pvalue: float | None = None
 
     @property
     def verdict(self) -> dict[str, Any]:

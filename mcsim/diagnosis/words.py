@@ -84,9 +84,11 @@ def status(result: DiagnosisResult) -> str:
     if result.kind == "unknown":
         p = result.test.pvalue
         chance = f" Data of the model depart as far in {100 * p:.2g} % of cases." if p > DISAGREES else ""
+        left = "" if result.nearest_pvalue is None else f"; what it leaves {residual(result.nearest_pvalue)}"
         return (
             f"The most similar candidate is {near.label}: cosine {result.cosine:.2f} with the departure, so that it "
-            f"accounts for {100 * result.cosine**2:.0f} % of the excess χ². It is a hint and not the cause.{chance}"
+            f"accounts for {100 * result.cosine**2:.0f} % of the excess χ²{left}. It is a hint and not the cause."
+            f"{chance}"
         )
     best = result.sets[0]
     if result.kind == "degenerate":

@@ -235,6 +235,15 @@ def test_a_marginal_departure_without_a_cause_may_be_chance(diagnoses, pvalue, s
     assert ("3 % of cases" in words.status(result)) == said
 
 
+def test_an_unknown_gap_says_what_the_nearest_candidate_leaves(diagnoses, tmp_path):
+    known = diagnoses["unknown"]
+    assert 0.0 < known.nearest_pvalue < 1e-4
+    assert f"what it leaves {words.residual(known.nearest_pvalue)}" in words.status(known)
+    known.save(tmp_path)
+    assert DiagnosisResult.open(tmp_path).nearest_pvalue == known.nearest_pvalue
+    assert "leaves" not in words.status(replace(known, nearest_pvalue=None))  # of version 0.1
+
+
 @pytest.mark.parametrize(("pvalue", "said"), [(1e-8, True), (0.2, False)])
 def test_a_group_that_departs_by_itself_is_told_where_the_global_test_finds_nothing(diagnoses, pvalue, said):
     known = diagnoses["none"]
