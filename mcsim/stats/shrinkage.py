@@ -14,7 +14,7 @@ LEAST = 0.5
 """Smallest eigenvalue of the target over that of the sample correlation: a target found pair by pair may have none."""
 
 FOLDS = 20
-LARGEST = 1_000_000  #: degrees of freedom of a covariance that is as good as known
+MOST = 10  #: simulations of a sample covariance that one may be worth: of few the measured number scatters to infinity
 
 
 class Fold(NamedTuple):
@@ -72,7 +72,7 @@ def shrunk(simulations: Matrix, floor: float, classes: NDArray[np.int64] | None 
         pairs += len(white) * (len(white) - 1)
         folds.append(Fold(white, own @ back))
     ratio = p * products / pairs / (total / count) ** 2
-    dof = int(min(max((ratio * (p + 3) - 1.0) / max(ratio - 1.0, 1e-9), p + 7), LARGEST))
+    dof = int(min(max((ratio * (p + 3) - 1.0) / max(ratio - 1.0, 1e-9), p + 7), MOST * count))
     scale = float(np.sqrt(dof * p / (dof - p - 1.0) / (total / count)))
     return Shrunk(scale * whitening / spread, dof, tuple(Fold(scale * one.white, one.turn) for one in folds))
 
