@@ -213,20 +213,23 @@ def measurement(
 ) -> Measurement:
     """Read the data vector of a fit.
 
-    ``data``: a store (a folder): its mean, with the covariance of its realizations over their number; or an ECSV table.
+    ``data``: a store (a folder): its mean, with the covariance of its realizations over their number; an ECSV table; or
+    a measurement, which has its selection.
     ``source``, ``selection``: configuration, whose frame the data must have, and the modes, multipoles, kind and pair
     that are fitted. ``covariance``: store that models the data: the covariance of one of its realizations replaces that
     of the data. Raise InputError for data that cannot be read, lack what is selected, or are in another frame than the
     configuration.
     """
     if isinstance(data, Measurement):
-        return data
+        if selection != EVERYTHING:
+            raise InputError("a measurement holds what is fitted; give the selection to what reads it, or none here.")
+        return data if covariance is None else with_covariance_of(data, covariance)
     path, frame = user_path(data), survey_of(source).frame
     if path.is_dir():
         measured = from_store(path, selection)
         check_frame(path, frame_of(store.attributes(path)["configuration"]), frame)
     else:
-        measured = read_table(path, frame, selection)
+        measured = read_table(path, frame, selection, errors=covariance is None)
     return measured if covariance is None else with_covariance_of(measured, covariance, selection.pair)
 
 

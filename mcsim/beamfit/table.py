@@ -17,13 +17,14 @@ from mcsim.support.folders import unreadable
 COLUMNS = ("L", "M", "d", "ell_min", "ell_max")  #: columns that identify the content of a row
 
 
-def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) -> Measurement:
+def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, errors: bool = True) -> Measurement:
     """Read binned spectra with independent errors from an ECSV table, which must have the frame of the model.
 
     Columns are L, M, d, ell_min, ell_max, value, error, and value_imag if parts are imaginary; ``value`` is the mean
     over ell_min <= l2 <= ell_max, d = l2 - l1, with its unit. The header's ``meta`` holds ``normalisation`` ("Bennett",
     "WMAP" or "Hajian-Souradeep"), ``scaling`` ("l(l+1)/2pi" or "none") and optionally ``frame``. ``mcsim info
     --export`` writes such tables, with a column ``pair`` and, for paired ensembles, ``value_difference`` and so on.
+    ``errors`` False: those of the table do not count, and are one each.
     Raise InputError for a table that cannot be read, or does not define its numbers.
     """
     table = read_ecsv(path)
@@ -46,7 +47,7 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
     real, error = (in_uk2(path, table, f"{name}{suffix}") for name in ("value", "error"))
     rows: list[Row] = []
     values: list[NDArray[np.float64]] = []
-    errors: list[NDArray[np.float64]] = []
+    sigmas: list[NDArray[np.float64]] = []
     for mode in selection.parsed:
         check_parity(path, mode, scaling)
         same = np.flatnonzero((L == mode.L) & (M == mode.M) & (d == mode.d) & (low >= first) & (high <= last))
@@ -55,14 +56,15 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING) 
             rows += [Row(mode, int(low[i]), int(high[i]), imaginary) for i in same]
             values.append(part[same])
             # The error of a mode with M > 0 is that of its modulus; its two parts share the variance equally.
-            errors.append(error[same] * (1.0 if mode.M == 0 else np.sqrt(0.5)))
+            sigmas.append(error[same] * (1.0 if mode.M == 0 else np.sqrt(0.5)))
     if not rows:
         raise InputError(
             f"{path} has no row of {', '.join(selection.modes)} within ell = {first} ... {last}; choose others."
         )
     if len(set(rows)) < len(rows):
         raise InputError(f"{path} gives a bin of one mode twice; keep one row of each.")
-    value, sigma = np.concatenate(values), np.concatenate(errors)
+    value = np.concatenate(values)
+    sigma = np.concatenate(sigmas) if errors else np.ones_like(value)
     bad = np.flatnonzero(~(np.isfinite(value) & np.isfinite(sigma) & (sigma > 0.0)))
     if len(bad):
         row = rows[bad[0]]

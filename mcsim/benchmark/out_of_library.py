@@ -53,7 +53,10 @@ def responses(run: config.RunConfig, file: str, call: Batch) -> dict[str, list[O
     added = [table_of(one, channel) for channel, one in units]
     quiet = replace(run.unfiltered(), channels=tuple(channel.without_noise() for channel in run.channels))
     runs = [with_effects(quiet, [*idle, *more]) for more in ((), *([one] for one in added))]
-    jobs = [(Job(config.to_json(run), config.to_json(one), 0, SKIES, True), file) for one in runs]
+    jobs = [
+        (Job(config.to_json(run), config.to_json(one), 0, SKIES, True, content=config.digest(run)), file)
+        for one in runs
+    ]
     simulated = dict(call(_data_vectors, jobs))
     before, *after = (simulated[index].mean(axis=0) for index in range(len(jobs)))
     result: dict[str, list[OutOfLibrary]] = {}

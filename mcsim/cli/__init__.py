@@ -97,7 +97,7 @@ def fit(
     data: Annotated[str, Argument(metavar="DATA", help="Store, or ECSV table of binned spectra.")],
     config: Config,
     model: Annotated[list[str] | None, Option(help="constant, linear, spline or orientation; repeatable.")] = None,
-    ell_min: Annotated[int, Option(min=0, help="First ell of the data.")] = 2,
+    ell_min: Annotated[int | None, Option(min=0, help="First ell of the data.")] = None,
     ell_max: Annotated[int | None, Option(min=2, help="Last ell of the data.")] = None,
     pair: Annotated[str | None, Option(help="Pair of maps; default: the only one.")] = None,
     mode: Annotated[list[str] | None, Option(help="Such as L2M0d0; repeatable; default: A20 at d = 0 and 2.")] = None,
@@ -115,7 +115,7 @@ def fit(
     from mcsim.plot.fit import fit_figure
 
     target, nthreads = picture(output, data, "-fit"), os.cpu_count() or 1
-    span = None if ell_max is None and ell_min == 2 else (ell_min, ell_max if ell_max is not None else 1 << 30)
+    span = None if ell_min is None and ell_max is None else (ell_min or 0, 1 << 30 if ell_max is None else ell_max)
     selection = beamfit.Selection(tuple(mode or beamfit.QUADRUPOLE), span, kind, pair)  # type: ignore[arg-type]
     survey = survey_of(config, nthreads)
     measured = beamfit.measurement(data, survey, selection, covariance)

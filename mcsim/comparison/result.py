@@ -165,7 +165,7 @@ class ComparisonResult:
 
     @property
     def accuracy(self) -> float:
-        """Rms of the difference over that of the sky, of all maps together."""
+        """Rms of the difference over that of the sky, of all maps together that differ."""
         return self._rms("rms_uk") / self._rms("sky_rms_uk")
 
     def _rms(self, name: str) -> float:

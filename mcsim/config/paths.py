@@ -78,9 +78,10 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
                 for place, item in enumerate(value if isinstance(value, list) else []):
                     if isinstance(item, str) and item.strip():
                         yield Entry(f"{where}.{field}[{place}]", value, place, rule, speaks_of, split)
-    for number, table in enumerate(_tables(plain, "effect")):
-        if str(table.get("name")).endswith(".py"):
-            yield Entry(f"effect[{number}].name", table, "name", Rule(), every)
+    for kind, field in (("effect", "name"), ("nuisance", "effect")):
+        for number, table in enumerate(_tables(plain, kind)):
+            if str(table.get(field)).endswith(".py"):
+                yield Entry(f"{kind}[{number}].{field}", table, field, Rule(), every)
     if ".py:" in str(plain.get("simulator")):
         yield Entry("simulator", plain, "simulator", Rule(checked=False), every)
 
@@ -115,7 +116,8 @@ def find_descriptions(plain: dict[str, Any]) -> None:
         scan = channel.get("scan")
         if not isinstance(scan, dict) or scan.get("kind") != "moments" or scan.get("model") is not None:
             continue
-        beside = Path(str(scan.get("path"))).parent / DESCRIPTION
+        path = str(scan.get("path")).replace("{channel}", str(channel.get("name")))
+        beside = Path(path).parent / DESCRIPTION
         if os.path.isfile(beside):  # False also for a name that no file system takes
             scan["model"] = str(beside)
 

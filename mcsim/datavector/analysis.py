@@ -63,6 +63,12 @@ class Analysis:
         """Return the descriptions of the numbers beside the data vector; none for measured spectra."""
         return slices_.elements_of(self.model) if self.of_maps else ()
 
+    @property
+    def acting(self) -> set[type[Effect]]:
+        """Return the effects and nuisances that the run names."""
+        named = [*(one.name for one in self.run.effects), *(one.effect for one in self.run.nuisances)]
+        return {systematics.get(name, dict(self.library)) for name in named}
+
     @cached_property
     def nuisances(self) -> tuple[Nuisance, ...]:
         """Return the nuisances of the run."""
@@ -93,10 +99,16 @@ class Analysis:
             return None
         return source if source.takes_sky or not given_sky else None
 
+    @cached_property
+    def content(self) -> str:
+        """Return the hash of the run and of its files."""
+        return config.digest(self.run)
+
     def job(self, simulated: config.RunConfig) -> "Job":
         """Return a job of no realization yet that simulates a run and analyses it."""
         fiducial, own = config.to_json(self.run), config.to_json(simulated)
-        return Job(fiducial, own, 0, 0, without=self.without, settings=self.settings, library=self.library)
+        known = Job(fiducial, own, 0, 0, without=self.without, settings=self.settings, library=self.library)
+        return replace(known, content=self.content)
 
 
 def analysis_of(
@@ -250,11 +262,12 @@ class Job:
     source: Source | None = None  # simulates in place of mcsim
     nuisances: bool = False  # draw those of the run
     chosen: tuple[str, ...] = ()  # kinds of structures that scores are wanted of besides those of the grammar
+    content: str = ""  # hash of the run that filters and of its files: what a process keeps of another one is older
 
     @property
-    def definition(self) -> tuple[str, tuple[str, ...], DiagnosisSettings, Kinds]:
+    def definition(self) -> tuple[str, tuple[str, ...], DiagnosisSettings, Kinds, str]:
         """Return what the analysis follows from."""
-        return self.fiducial, self.without, self.settings, self.library
+        return self.fiducial, self.without, self.settings, self.library, self.content
 
 
 def data_vectors(job: Job, library: Library | None = None) -> Vector:
@@ -290,6 +303,7 @@ def simulated_maps(job: Job, library: Library | None = None) -> Iterator[list[Ma
                 without_effects(job.simulated),
                 job.library if library is None else kinds_of(library),
                 hash(observed),
+                job.content,
             )
             yield _untouched().maps(shared, realization, sky, which)
 
@@ -319,13 +333,16 @@ def _seed_and_added(simulated: str, fiducial: str) -> tuple[int, tuple[config.Ef
 def surveys(job: Job, library: Library | None = None) -> Iterator[tuple[int, Survey]]:
     """Yield every realization of a job with its survey: the same for all, but for the nuisances that each draws."""
     kinds = job.library if library is None else kinds_of(library)
-    disturbed = _disturbed(job.simulated, kinds) if job.nuisances else None
+    disturbed = _disturbed(job.simulated, kinds, job.content) if job.nuisances else None
     for realization in range(job.first, job.first + job.count):
-        yield realization, _survey(job.simulated, kinds) if disturbed is None else disturbed.at(realization)
+        yield (
+            realization,
+            _survey(job.simulated, kinds, job.content) if disturbed is None else disturbed.at(realization),
+        )
 
 
 @lru_cache(maxsize=1)
-def _disturbed(simulated: str, kinds: Kinds) -> DisturbedSurvey:
+def _disturbed(simulated: str, kinds: Kinds, content: str) -> DisturbedSurvey:
     return DisturbedSurvey.of(config.from_json(simulated), dict(kinds))
 
 
@@ -348,11 +365,13 @@ def _constrained_sky(definition: tuple[Any, ...], observed: bytes, seed: int, re
 
 
 @lru_cache(maxsize=2)
-def _survey(simulated: str, kinds: Kinds) -> Survey:
+def _survey(simulated: str, kinds: Kinds, content: str) -> Survey:
     """Keep the last surveys: jobs of a run follow each other, and a gain drift takes a pass over the pointing."""
     return survey(config.from_json(simulated), library=dict(kinds))
 
 
 @lru_cache(maxsize=1)
-def _analysis(fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings, kinds: Kinds) -> Analysis:
+def _analysis(
+    fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings, kinds: Kinds, content: str
+) -> Analysis:
     return analysis_of(config.from_json(fiducial), without, settings=settings, library=dict(kinds))

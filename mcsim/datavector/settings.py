@@ -258,8 +258,11 @@ class DiagnosisSettings:
         levels = [field.name for field in fields(self) if field.name.endswith(("_level", "_pvalue", "_share"))]
         skies = ("channel_skies", "typical_skies", "common_skies", "noisy_skies", "table_skies")
         sims = ("sims_per_element", "pilot_sims_per_element")
-        least = {**dict.fromkeys((*skies, *sims), 2), "beam_orders": 1}
+        least = {**dict.fromkeys((*skies, *sims), 2), "beam_orders": 1, "beam_bins": 1, "sky_bins": 1}
         check_settings(self, ["alpha", "named_probability", *levels], least)
+        edges = list(self.latitude_edges)
+        if len(edges) < 2 or edges != sorted(set(edges)):
+            raise InputError(f"latitude_edges = {self.latitude_edges!r} are no ranges; give two or more, rising.")
         orders = max(self.beam_orders, self.split_beam_orders)
         if len(self.beam_bins) <= orders:
             raise InputError(

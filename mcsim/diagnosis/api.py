@@ -282,9 +282,7 @@ def _key(run: config.RunConfig, analysis: Analysis, settings: DiagnosisSettings 
     """
     science = config.science(run, *(("nuisance",) if run.nuisances else ()))
     science["ensemble"] = {}
-    effects = {candidate.effect for candidate in analysis.candidates}
-    named = [*(one.name for one in run.effects), *(one.effect for one in run.nuisances)]
-    effects |= {systematics.get(name, dict(analysis.library)) for name in named}
+    effects = {candidate.effect for candidate in analysis.candidates} | analysis.acting
     rest = [
         [[candidate.label, [repr(basis) for basis in candidate.basis]] for candidate in analysis.candidates],
         asdict(settings or analysis.settings),

@@ -30,6 +30,7 @@ from mcsim.simulation.nuisance import DisturbedSurvey
 from mcsim.simulation.survey import Survey
 from mcsim.simulation.survey import survey as survey_
 from mcsim.support import folders
+from mcsim.support.code import package_digest
 from mcsim.support.npy import read_npy
 from mcsim.support.numbers import duration
 from mcsim.support.progress import reporting
@@ -162,7 +163,8 @@ def diagnose_controls(known: DiagnosisContext, key: str, count: int, call: Batch
     with reporting("orientation moments of the controls", 1.0, "", quiet) as report:
         drawn = fidelity(known.analysis, os.cpu_count() or 1)
         report(1.0)
-    text = json.dumps([key, config.science(drawn.run), drawn.sample_by_sample], sort_keys=True)
+    code = package_digest(["mcsim.diagnosis"])
+    text = json.dumps([key, config.science(drawn.run), drawn.sample_by_sample, code], sort_keys=True)
     folder = folders.default_cache_dir().absolute() / "controls" / hashlib.sha256(text.encode()).hexdigest()[:32]
     missing = [number for number in range(count) if not _verdict(folder, number).is_file()]
     absent = [number for number in missing if not _maps(folder, number).is_dir()]

@@ -97,8 +97,11 @@ def _flat(given: Any, labels: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str,
     import xarray as xr  # here and below: workers of mcsim's own simulator start without it
 
     if isinstance(given, xr.Dataset):
-        whole = [one for one in given.data_vars.values() if {"map_name", "channel"} & set(one.dims)]
-        given = whole[0] if whole else dict(given.data_vars)
+        labelled = {name: one for name, one in given.data_vars.items() if {"map_name", "channel"} & set(one.dims)}
+        whole = {name: one for name, one in labelled.items() if set(one.dims) - {"map_name", "channel", "split"}}
+        if len(whole) > 1:
+            raise InputError(f"a dataset has maps in {', '.join(map(str, whole))}; give the variable that is meant.")
+        given = next(iter(whole.values())) if whole else {n: one for n, one in given.data_vars.items() if one.ndim}
     if isinstance(given, xr.DataArray):
         for dim in ("map_name", "channel", "split"):
             if dim in given.dims:
@@ -248,6 +251,8 @@ def stacked(given: Any, parts: tuple[Part, ...]) -> str:
         given = xr.DataArray(given, dims=("realization", "map_name", "pixel"), coords={"map_name": names})
     stack = _checked_stack(given, "what is given")
     number = int(stack.sizes["realization"])
+    if number == 0:
+        raise InputError("what is given has no realization; give some.")
 
     def rows(r: int) -> list[Map]:
         return in_order(stack.isel(realization=r), parts, f"realization {r} of the given maps")

@@ -39,10 +39,10 @@ def binned(layout: Layout, values: NDArray, power: int = 1) -> NDArray:
     return divided(total, count**power, np.nan)
 
 
-def reduce_rows(layout: Layout, rows: Mapping[str, NDArray], first: int) -> Sums | None:
+def reduce_rows(layout: Layout, rows: Mapping[str, NDArray]) -> Sums | None:
     """Reduce consecutive realizations, arrays as stored with ``done``, to statistics, by the tree of their indices.
 
-    ``first``, the index of the first row, is a multiple of the smallest power of two not below the number of rows.
+    The index of the first row is a multiple of the smallest power of two not below the number of rows.
     """
 
     def node(row: int) -> Sums | None:

@@ -147,6 +147,6 @@ def summarise_node(path: str, layout: Layout, start: int, stop: int) -> Sums | N
         end = min(first + layout.chunk, stop)
         if not store.done(target, first, end).any():
             return None
-        return summary.reduce_rows(layout, store.read(target, first, end), first)
+        return summary.reduce_rows(layout, store.read(target, first, end))
 
     return streaming.tree(node, len(starts))

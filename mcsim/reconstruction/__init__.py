@@ -5,6 +5,7 @@ from mcsim.reconstruction.forms import (
     AddedToSamples,
     BeamOrder,
     BoostedSky,
+    CompactSource,
     Elsewhere,
     GainOfOne,
     GainOverTime,
@@ -16,6 +17,6 @@ from mcsim.reconstruction.forms import (
 )  # fmt: skip
 
 __all__ = [
-    "AddedPattern", "AddedToSamples", "BeamOrder", "BoostedSky", "Elsewhere", "GainOfOne", "GainOverTime",
-    "GainPattern", "NoisePattern", "RotatedSky", "SignalPower", "SkyPower",
+    "AddedPattern", "AddedToSamples", "BeamOrder", "BoostedSky", "CompactSource", "Elsewhere", "GainOfOne",
+    "GainOverTime", "GainPattern", "NoisePattern", "RotatedSky", "SignalPower", "SkyPower",
 ]  # fmt: skip

@@ -429,6 +429,5 @@ def _scaled(scene: Scene) -> Iterator[Structure]:
     for index in INDICES:
         weights = (frequencies / REFERENCE_GHZ) ** index
         for stage, acts_on, frame, kind, keys, mix in _added(scene):
-            yield Structure(
-                stage, acts_on, frame, kind, None, ALIKE, index, _rows(scene, keys, views), weights, mix, views
-            )
+            own = None, ALIKE, index, _rows(scene, keys, views), weights, mix, views, _tried(scene, kind)
+            yield Structure(stage, acts_on, frame, kind, *own)

@@ -46,7 +46,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.support import folders
 from mcsim.support.arrays import Map, Matrix, Vector, divided
-from mcsim.support.code import package_digest
+from mcsim.support.code import class_digest, package_digest
 from mcsim.systematics import Pointing
 from mcsim.systematics.spacecraft import axes, heading, spin_phase
 
@@ -122,7 +122,8 @@ def scene_of(model: Model) -> Scene:
         elsewhere=tuple(elsewhere),
         time_lines=tuple(_time_line(model, channel) for channel in range(len(model.channels))) if timed else (),
     )
-    skies = (list(simulate.maps(model.survey, k)) for k in range(SPREAD))
+    other = replace(model.survey, config=seeded(run, SEED))
+    skies = (list(simulate.maps(other, SIMULATIONS + k)) for k in range(SPREAD))
     return scene.with_spreads([wiener_filter(model, maps) for maps in skies])
 
 
@@ -271,8 +272,8 @@ def scene_for(job: Job) -> Scene:
 
 
 @lru_cache(maxsize=1)
-def _scene(fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings, library: Kinds) -> Scene:
-    job = Job(fiducial, fiducial, 0, 0, without=without, settings=settings, library=library)
+def _scene(fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings, library: Kinds, content: str) -> Scene:
+    job = Job(fiducial, fiducial, 0, 0, content=content, without=without, settings=settings, library=library)
     return scene_of(analysis_for(job).model)
 
 
@@ -322,7 +323,10 @@ def null_scores(analysis: Analysis, ask: Ask, chosen: tuple[str, ...] = ()) -> M
     run = analysis.run
     science = config.science(run, *(("nuisance",) if run.nuisances else ()))
     identity = [science | {"ensemble": {}}, SIMULATIONS, chosen, package_digest(f"mcsim.{name}" for name in CODE)]
-    identity.append(asdict(replace(analysis.settings, without=(), including=())))
+    identity += [
+        asdict(replace(analysis.settings, without=(), including=())),
+        sorted(map(class_digest, analysis.acting)),
+    ]
     key = hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:32]
 
     def fill(folder: Path) -> None:

@@ -234,8 +234,8 @@ class DisturbedSurvey:
             for key, hook, mean in (("gain", "gain", gain_of), ("signal_uk", "signal", signal_of)):
                 if getattr(one.effect, hook) is getattr(Effect, hook) or one.channel not in (None, channel.name):
                     continue
-                basis, splits = basis_of(one.effect, one.settings), len(channel.maps)
-                shares = [(n / splits, (n + 1) / splits) for n in range(splits)]
+                basis = basis_of(one.effect, one.settings)
+                shares = [self.survey.config.map.span(n) for n in range(len(channel.maps))]
                 found[number, channel.name, key] = [
                     np.stack([mean(effect, channel.site, share) / effect.amplitude for effect in basis])
                     for share in shares

@@ -5,7 +5,6 @@ of white noise, and of what belongs to the samples of a pixel (hits, orientation
 """
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import healpy
@@ -23,6 +22,7 @@ from mcsim.sphere import healpix, rotation
 from mcsim.sphere.checks import UNSEEN_BELOW, check_complete, check_map
 from mcsim.sphere.mask import read_mask
 from mcsim.support.arrays import Map
+from mcsim.support.loading import once_per_content
 from mcsim.systematics import Site
 
 LARGEST_GAIN = 10.0  #: of B_l by a change of the beam: a target that asks for more is narrower than the beam
@@ -199,7 +199,7 @@ def _template(path: Path, nside: int, frame: str, spec: config.Channel) -> Map:
     return template
 
 
-@lru_cache(maxsize=32)
+@once_per_content(32)
 def _read_mask(path: Path, nside: int, frame: str, mask_frame: str | None) -> Map:
     mask = read_mask(path, nside, frame, mask_frame)
     mask.setflags(write=False)

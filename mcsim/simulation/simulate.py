@@ -130,7 +130,7 @@ def _observe(
     smooth = ensemble.keep_maps or not (plain and all(_is_exact(survey, m) for m in channel.maps))
     known = None
     if plain and channel.side_b is None:
-        known = _circular(survey, channel, *_seen(survey, channel, sky, realization))
+        known = _circular(channel, *_seen(survey, channel, sky, realization))
     parts_of_maps = _map_parts(making, source, sky, realization, made, smooth)
     for m, (own, parts) in zip(channel.maps, parts_of_maps, strict=True):
         if survey.filtering is not None:
@@ -196,7 +196,7 @@ def _map_parts(
         for m, circular_uk, rest_uk in differencing.maps(channel, seen, dipole, seed, realization, nthreads):
             yield m, MapParts(circular_uk, None, rest_uk)
         return
-    circular = _circular(survey, channel, seen, dipole)
+    circular = _circular(channel, seen, dipole)
     spins = convolve.spin_maps(seen, channel.response, nside, nthreads)
     if dipole is not None:
         for s, map_uk in convolve.spin_maps(dipole, _fiducial_response(channel), nside, nthreads).items():
@@ -247,7 +247,7 @@ def _unwindowed(channel: Channel, seen: Alm, dipole: Alm | None) -> Alm:
     return circular - convolve.circular_alm(dipole, convolve.response(channel.site.beam, lmax))
 
 
-def _circular(survey: Survey, channel: Channel, seen: Alm, dipole: Alm | None) -> Alm:
+def _circular(channel: Channel, seen: Alm, dipole: Alm | None) -> Alm:
     """Return what the circular part of the beam sees, less the dipole through the fiducial beam.
 
     The pixel window is in it; where the samples' offsets count beyond their mean, what stands in its place.

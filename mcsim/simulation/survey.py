@@ -34,6 +34,7 @@ from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.checks import check_whole
 from mcsim.sphere.mask import read_mask
 from mcsim.support.arrays import divided
+from mcsim.support.loading import once_per_content
 from mcsim.systematics import Effect, Library, Site, seen_through, spread_of, variance_factor
 
 Progress = Callable[[float], None]
@@ -351,7 +352,7 @@ def _moments(
 _mapped = lru_cache(maxsize=16)(scan.Moments.load)  # once for all surveys: the folder's name says what is in it
 
 
-@lru_cache(maxsize=16)
+@once_per_content(16)
 def _moments_of_file(path: Path, nside: int, smax: int | None, frame: str) -> scan.Moments:
     """Read moments once for all surveys of a process that differ in effects alone."""
     return scan.read_moments(path, nside, smax, frame)

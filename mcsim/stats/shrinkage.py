@@ -13,7 +13,7 @@ ROUNDS = 60  #: in which the shares of these distributions are found
 LEAST = 0.5
 """Smallest eigenvalue of the target over that of the sample correlation: a target found pair by pair may have none."""
 
-FOLDS = 20
+FOLDS = 20  #: at most, with two simulations in each
 MOST = 10  #: simulations of a sample covariance that one may be worth: of few the measured number scatters to infinity
 
 
@@ -31,7 +31,7 @@ class Shrunk(NamedTuple):
     """Hold a whitening, shape (p, p_raw), and what it is worth.
 
     ``dof``: degrees of freedom of the sample covariance that would be as good. ``folds``: simulation i is in fold i
-    modulo ``FOLDS``.
+    modulo their number.
     """
 
     whitening: Matrix
@@ -60,9 +60,9 @@ def shrunk(simulations: Matrix, floor: float, classes: NDArray[np.int64] | None 
     basis = vectors[:, values > floor * values[-1]].T
     whitening, folds = _whitening(z, basis, classes), []
     p, count, back = len(whitening), len(simulations), np.linalg.pinv(whitening)
-    total, products, pairs = 0.0, 0.0, 0
-    for number in range(FOLDS):
-        out = np.arange(count) % FOLDS == number
+    total, products, pairs, parts = 0.0, 0.0, 0, min(FOLDS, count // 2)
+    for number in range(parts):
+        out = np.arange(count) % parts == number
         rest = z[~out]
         own = _whitening(rest, basis, classes)
         white = (z[out] - rest.mean(axis=0)) @ own.T / np.sqrt(1.0 + 1.0 / len(rest))

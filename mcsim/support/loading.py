@@ -1,9 +1,16 @@
-"""Load large modules quickly."""
+"""Load large modules quickly, and files once for as long as they stay as they are."""
 
 import gc
+import os
 import sys
+from collections.abc import Callable
+from functools import lru_cache, wraps
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
+from typing import Any, TypeVar
+
+Read = TypeVar("Read", bound=Callable[..., Any])
 
 
 def loaded(name: str) -> ModuleType:
@@ -24,3 +31,25 @@ def loaded(name: str) -> ModuleType:
         if collecting:
             gc.enable()
     return module
+
+
+def once_per_content(maxsize: int) -> Callable[[Read], Read]:
+    """Return a decorator that keeps the last results of a reader of a file, its first argument, until that is changed.
+
+    A file counts as changed if its size or its time of writing is another.
+    """
+
+    def decorated(read: Read) -> Read:
+        kept = lru_cache(maxsize=maxsize)(lambda written, *given: read(*given))
+
+        @wraps(read)
+        def found(path: str | Path, *given: Any) -> Any:
+            try:
+                now = os.stat(path)
+            except OSError:
+                return read(path, *given)  # which says what is missing
+            return kept((now.st_mtime_ns, now.st_size), path, *given)
+
+        return found  # type: ignore[return-value]
+
+    return decorated

@@ -23,7 +23,7 @@ def check_settings(settings: Any, shares: Iterable[str] = (), least: Mapping[str
     """Raise InputError unless the fields of a dataclass are of the kind of their defaults, and numbers not negative.
 
     Those named in ``shares`` lie between 0 and 1, and what is in ``least`` is no less than that. An ``int | None`` is
-    whole.
+    whole. Items of a tuple of numbers are such numbers, and there are some.
     """
     bounded, least = set(shares), least or {}
     for field in fields(settings):
@@ -34,6 +34,8 @@ def check_settings(settings: Any, shares: Iterable[str] = (), least: Mapping[str
             default = 1
         if isinstance(default, tuple) and (isinstance(value, str) or not isinstance(value, tuple | list)):
             raise InputError(f"{field.name} = {value!r} is no tuple; give one, such as ({value!r},).")
+        if isinstance(default, tuple) and default and not isinstance(default[0], str):
+            _check_items(field.name, value, default[0], least.get(field.name, 0))
         if isinstance(default, bool) and not isinstance(value, bool):
             raise InputError(f"{field.name} = {value!r} is neither True nor False; give one of them.")
         if isinstance(default, int | float) and not isinstance(default, bool):
@@ -43,3 +45,11 @@ def check_settings(settings: Any, shares: Iterable[str] = (), least: Mapping[str
                 kind = "a whole number" if isinstance(default, int) else "a number"
                 limit = "from 0 to 1" if largest == 1.0 else f"of {smallest} or more"
                 raise InputError(f"{field.name} = {value!r} is out of range; give {kind} {limit}.")
+
+
+def _check_items(name: str, values: Iterable[Any], default: float, smallest: float) -> None:
+    """Raise InputError unless there are values, each a number like the default one and no less than the smallest."""
+    kind = "whole numbers" if isinstance(default, int) else "numbers"
+    found = [isinstance(one, int | float) and not isinstance(one, bool) and one >= smallest for one in values]
+    if not found or not all(found) or (isinstance(default, int) and any(one != int(one) for one in values)):
+        raise InputError(f"{name} = {values!r} does not do; give {kind} of {smallest} or more.")

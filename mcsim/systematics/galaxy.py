@@ -13,6 +13,7 @@ from mcsim.sphere import healpix
 from mcsim.sphere.checks import check_complete
 from mcsim.sphere.rotation import rotate_alm
 from mcsim.sphere.sky import gaussian_alm
+from mcsim.support.loading import once_per_content
 from mcsim.systematics.base import Alm, Draw, Site
 from mcsim.systematics.parametrization import Vector
 from mcsim.systematics.product import multiplied
@@ -35,7 +36,7 @@ def morphology(template: str, site: Site, draw: Draw) -> Alm:
     return _drawn(site.lmax, site.frame, json.dumps(draw("morphology").bit_generator.state))
 
 
-@lru_cache(maxsize=4)
+@once_per_content(4)
 def template_alm(path: str, lmax: int, frame: str) -> Alm:
     """Return the coefficients of a map, up to l = 2 nside, in ``frame``; its own frame is its header's, or galactic."""
     values, found, _ = healpix.read_map(Path(path))

@@ -1,6 +1,7 @@
 """Digests of code follow the code, and nothing else."""
 
 import importlib
+import subprocess
 import sys
 
 import pytest
@@ -35,15 +36,16 @@ def test_a_class_is_known_by_its_code(plugin):
     kind = importlib.import_module("plugin_of_a_user").Thing
     before = class_digest(kind)
     assert class_digest(kind) == before
-    plugin.write_text(SOURCE.replace("x + 1", "x + 2"))
-    assert class_digest(kind) != before
+    plugin.write_text(SOURCE.replace("x + 1", "x + 22"))
+    assert class_digest(kind) == before  # what is loaded does not change
+    assert class_digest(importlib.reload(sys.modules["plugin_of_a_user"]).Thing) != before
 
 
 def test_a_module_beside_it_counts(plugin):
     kind = importlib.import_module("plugin_of_a_user").Thing
     before = class_digest(kind)
     (plugin.parent / "constants.py").write_text("E = 0.1\n")
-    assert class_digest(kind) != before
+    assert class_digest(importlib.reload(sys.modules["plugin_of_a_user"]).Thing) != before
 
 
 def test_what_a_module_imports_from_its_folder_counts(tmp_path, monkeypatch):
@@ -63,11 +65,54 @@ def test_what_a_module_imports_from_its_folder_counts(tmp_path, monkeypatch):
     digests = [class_digest(kind)]
     for name, text in files.items():
         (tmp_path / f"{name}.py").write_text(text + "F = 1\n")
-        digests.append(class_digest(kind))
+        digests.append(class_digest(importlib.reload(sys.modules["single_module_of_a_user"]).Thing))
     for name in files:
         sys.modules.pop(name, None)
     assert len(set(digests)) == 4
     assert digests[4] == digests[3], "a file that is not imported"
+
+
+SCRIPT = """
+from dataclasses import dataclass
+from mcsim.support.code import class_digest
+
+FACTOR = 2.0
+
+def helper(x):
+    return FACTOR * x
+
+@dataclass
+class Thing:
+    amplitude: float = 1.0
+
+    def __call__(self, x):
+        return helper(x) + self.amplitude
+
+def made(offset):
+    class Own:
+        def __call__(self, x):
+            return x + offset
+    return Own
+
+print(class_digest(Thing), class_digest(made(1.0)), class_digest(made(2.0)))
+"""
+
+
+def test_of_a_script_what_a_class_uses_counts(tmp_path):
+    """Constants, and functions that it calls, directly or not; and what a function gives to a class that it makes."""
+
+    def digests(text):
+        (tmp_path / "script.py").write_text(text)
+        return subprocess.run(
+            [sys.executable, str(tmp_path / "script.py")], capture_output=True, text=True, check=True
+        ).stdout.split()
+
+    thing, one, two = digests(SCRIPT)
+    assert digests(SCRIPT) == [thing, one, two]
+    assert one != two
+    assert digests(SCRIPT.replace("FACTOR = 2.0", "FACTOR = 3.0"))[0] != thing
+    assert digests(SCRIPT.replace("FACTOR * x", "FACTOR * x**2"))[0] != thing
+    assert digests(SCRIPT + "OTHER = 1\n") == [thing, one, two]
 
 
 def test_versions_count():

@@ -35,7 +35,7 @@ def key(effect, settings=None, run=RUN):
         candidates=(Candidate(effect, None, (0,)),),
         elements=(),
         settings=settings or DiagnosisSettings(),
-        library=(),
+        acting=set(),
         source=None,
     )
     return api._key(run, analysis)
@@ -55,8 +55,8 @@ def test_an_effect_with_other_code_is_learned_anew(plugin):
     effect = importlib.import_module("effects_of_a_user").Tilt
     before = key(effect)
     assert key(effect) == before
-    plugin.write_text(SOURCE.replace("1.0 + self", "1.0 - self"))
-    assert key(effect) != before
+    plugin.write_text(SOURCE.replace("1.0 + self", "1.0 - 1.0 * self"))
+    assert key(importlib.reload(sys.modules["effects_of_a_user"]).Tilt) != before
 
 
 def test_a_constant_of_any_package_that_computes_is_learned_anew(plugin, monkeypatch):
@@ -74,7 +74,8 @@ def test_a_constant_of_any_package_that_computes_is_learned_anew(plugin, monkeyp
 def test_every_setting_has_a_part_in_the_key(plugin, field):
     effect = importlib.import_module("effects_of_a_user").Tilt
     default = DiagnosisSettings()
-    value = {"beam_orders": 3, "beam_bins": (3, 2, 2, 1, 1)}.get(field.name, another(getattr(default, field.name)))
+    given = {"beam_orders": 3, "beam_bins": (3, 2, 2, 1, 1), "latitude_edges": (0.0, 1.0)}
+    value = given.get(field.name, another(getattr(default, field.name)))
     assert key(effect, replace(default, **{field.name: value})) != key(effect)
 
 
