@@ -17,7 +17,7 @@ from mcsim import cli, config
 from mcsim.datavector import campaign
 from mcsim.diagnosis import api
 from mcsim.ensemble.external import seed_of, source_of
-from mcsim.ensemble.external_maps import in_order, parts_of
+from mcsim.ensemble.external_maps import in_order, parts_of, stacked
 from mcsim.ensemble.maps import write_map
 from mcsim.errors import RunError
 from mcsim.simulation import simulate
@@ -467,3 +467,11 @@ def test_names_and_units_of_maps(tmp_path):
     ):
         found = in_order(given, parts, "here")
         np.testing.assert_allclose(found, [a, b])
+    whole = xr.DataArray([a, b], dims=("map_name", "pixel"), coords={"map_name": ["V:a", "V:b"]})
+    beams = xr.DataArray([30.0], dims="channel", coords={"channel": ["V"]})
+    found = in_order(xr.Dataset({"fwhm": beams, "maps": whole}), parts, "here")
+    np.testing.assert_allclose(found, [a, b])
+    with refused("maps", "noise"):
+        in_order(xr.Dataset({"noise": 0.1 * whole, "maps": whole}), parts, "here")
+    with refused("realization"):
+        stacked(np.zeros((0, 2, 12)), parts)

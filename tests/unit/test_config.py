@@ -31,6 +31,25 @@ def test_defaults(plain, folder):
     assert run.channels[1].scan.model == str(folder / "scan.toml")
 
 
+def test_the_description_of_a_scan_is_found_where_the_folder_names_its_channel(plain, folder):
+    (folder / "scans/V1").mkdir(parents=True)
+    for name in ("scan.toml", "moments.npz"):
+        (folder / "scans/V1" / name).write_text("contents")
+    plain["channel"][1]["scan"] = {"kind": "moments", "path": "scans/{channel}/moments.npz"}
+    assert config.load(plain).channels[1].scan.model == str(folder / "scans/V1/scan.toml")
+
+
+def test_the_file_of_a_nuisance_is_found_beside_the_configuration(plain, folder, monkeypatch):
+    (folder / "mine.py").write_text("contents")
+    plain["nuisance"] = [{"effect": "mine.py", "width": 0.1}]
+    (folder / "run.json").write_text(json.dumps(plain))
+    run = config.load(plain)
+    assert run.nuisances[0].effect == str(folder / "mine.py")
+    before = config.science(run, "nuisance")
+    (folder / "mine.py").write_text("other contents")
+    assert config.science(run, "nuisance") != before
+
+
 def test_quickstart_is_packaged_and_documented_values_hold():
     run = config.load("quickstart")
     assert (run.map.nside, run.sky.lmax, run.biposh.L_max, run.ensemble.realizations) == (128, 256, 2, 64)

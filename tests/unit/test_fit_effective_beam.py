@@ -8,7 +8,7 @@ import pytest
 from astropy.table import Table
 
 from mcsim import config
-from mcsim.beamfit import Measurement, comparisons, fit_each, orientation, report
+from mcsim.beamfit import Measurement, Selection, comparisons, fit_each, measurement, orientation, report
 from mcsim.beamfit import fit as fit_to_any_order
 from mcsim.beamfit.data import SUMMARY, Row, project
 from mcsim.bipolar import parse_mode
@@ -170,6 +170,8 @@ def test_refusals(shared):
         fit(data, configuration() | {"biposh": {"lmax": 100}})
     with refused("synthetic", "ensemble"):
         fit_each(fit(data, shared))
+    with refused("selection"):
+        measurement(data, shared, Selection(["L2M0d0"]))
     with refused("quadratic", "linear"):
         fit(data, shared, "quadratic")
     two = configuration()

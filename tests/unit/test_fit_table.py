@@ -129,3 +129,10 @@ def test_a_file_that_is_no_table(tmp_path):
         read_table(tmp_path / "x.ecsv", "ecliptic")
     with refused("none.ecsv", "ECSV"):
         read_table(tmp_path / "none.ecsv", "ecliptic")
+
+
+def test_errors_that_do_not_count_may_be_missing(tmp_path):
+    made = table(error=[np.nan, 0.0, 0.3])
+    with refused("L2M0d0", "error"):
+        read(tmp_path, made)
+    np.testing.assert_array_equal(read_table(tmp_path / "table.ecsv", "ecliptic", errors=False).value, [1.0, 2.0, 3.0])

@@ -61,6 +61,17 @@ MANY = (
 STEPS = [{"kind": "smooth", "fwhm_arcmin": 1200.0}, {"kind": "subtract_dipole"}]
 
 
+def test_maps_of_rings_have_the_drift_of_all_of_the_time():
+    drifting = {"effect": "gain_drift", "channel": "W1", "width": [0.001, 0.002]}
+    run = model(drifting, map={"nside": NSIDE, "splits": ["a", "b"], "split_by": "rings"})
+    found = {channel.name: channel.maps for channel in DisturbedSurvey.of(run).at(0).channels}
+    acting = replace(run, effects=tuple(tables(run, run.ensemble.seed, 0)))
+    for channel in survey(acting).channels:
+        if channel.name == "W1":
+            for one, other in zip(found["W1"], channel.maps, strict=True):
+                np.testing.assert_allclose(one.gain, other.gain, atol=1e-12)
+
+
 @pytest.mark.parametrize("preparation", [[], STEPS], ids=["plain", "prepared"])
 def test_a_disturbed_survey_is_that_of_a_run_with_the_effects_that_are_drawn(preparation):
     run = model(*MANY, preparation=preparation)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from instruments import two_channels
-from mcsim import config, systematics
+from mcsim import config, reconstruction, systematics
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import model_of, wiener_filter
 from mcsim.diagnosis import api
@@ -72,6 +72,10 @@ TOLERANCE = {
     "lag": 0.05,  # a difference of places as near as pixels
     "source 40.0 -25.0": 0.3,  # as small as pixels, in which the samples' offsets move it: 6 to 9 % rms in the maps
 }
+
+
+def test_files_of_effects_can_name_every_form():
+    assert set(forms.FORMS) == set(reconstruction.__all__)
 
 
 def added_by(structure, theta):
