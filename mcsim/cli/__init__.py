@@ -6,10 +6,11 @@ Exit codes: 0 done, 1 failed realizations, 2 bad input, 130 interrupted.
 import json
 import os
 import sys
+import warnings
 from dataclasses import fields, replace
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
@@ -26,7 +27,6 @@ from mcsim.cli.common import (
     Simulations,
     Workers,
     chosen,
-    interrupt_once,
     picture,
     save,
 )
@@ -48,6 +48,7 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # of a terminal that may lack ± and µ
             stream.reconfigure(errors="replace")
+    warnings.showwarning = _warned
     try:
         app()
     except (InputError, RunError) as error:
@@ -62,6 +63,17 @@ def main() -> None:
         what = error.filename or "the output"
         print(f"mcsim: {what}: {error.strerror}; check its permissions and the space on its disk.", file=sys.stderr)
         sys.exit(1)
+
+
+_of_python = warnings.showwarning
+
+
+def _warned(message: Any, category: Any, filename: str, lineno: int, file: Any = None, line: Any = None) -> None:
+    """Say a warning of mcsim's own in a sentence, and any other one as Python does."""
+    if Path(filename).is_relative_to(Path(__file__).parents[1]):
+        print(f"mcsim: {message}", file=sys.stderr)
+    else:
+        _of_python(message, category, filename, lineno, file, line)
 
 
 def _version(asked: bool) -> None:
@@ -195,7 +207,6 @@ def diagnose(
     from mcsim.diagnosis.api import diagnose as judge
     from mcsim.diagnosis.words import summary
 
-    interrupt_once()
     where, run = chosen(workers, scheduler), config.load(model)
     chosen_settings = DiagnosisSettings.quick if quick else DiagnosisSettings
     settings = chosen_settings(
@@ -237,7 +248,6 @@ def limit(
     from mcsim.information.api import limit as compute
     from mcsim.information.settings import LimitSettings
 
-    interrupt_once()
     settings = LimitSettings(
         only=tuple(only or ()),
         without=tuple(without or ()),
@@ -309,7 +319,6 @@ def challenge_make(
     from mcsim.benchmark.challenge import make
     from mcsim.benchmark.folder import Settings
 
-    interrupt_once()
     file = None if inventions is None else str(inventions)
     shared = Settings(
         config.load(model),
@@ -327,7 +336,6 @@ def challenge_run(folder: Folder, workers: Workers = None, scheduler: Scheduler 
     """Diagnose all cases that have no verdict."""
     from mcsim.benchmark.challenge import run as diagnose_all
 
-    interrupt_once()
     print(f"{diagnose_all(folder, workers=chosen(workers, scheduler), quiet=False)} cases diagnosed")
 
 

@@ -1,12 +1,13 @@
 """Shared parts of the commands: arguments, output, interruption, figures."""
 
 import signal
+import sys
 from pathlib import Path
 from tempfile import TemporaryFile
 from types import FrameType
 from typing import Annotated, Any
 
-from typer import Argument, Option
+from typer import Argument, Exit, Option
 from typer.core import TyperCommand, TyperGroup
 
 from mcsim.errors import InputError
@@ -21,12 +22,33 @@ def _without_types(options: list[Any]) -> list[Any]:
     return options
 
 
+def _interrupt_once() -> None:
+    """Interrupt at Ctrl-C or SIGTERM; ignore a second one."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        for name in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(name, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    for name in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(name, interrupt)
+
+
 class Command(TyperCommand):
-    """A command whose flags show no type in --help."""
+    """A command whose flags show no type in --help, and that ends in order when it is interrupted."""
 
     def get_params(self, ctx: Any) -> Any:
         """Return the parameters of the command."""
         return _without_types(super().get_params(ctx))
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; Ctrl-C or a batch system's SIGTERM ends in a sentence and exit code 130."""
+        _interrupt_once()
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            print("mcsim: interrupted; run the same command again to continue.", file=sys.stderr)
+            raise Exit(130) from None
 
 
 class Group(TyperGroup):
@@ -55,18 +77,6 @@ def chosen(workers: int | None, scheduler: str | None) -> int | str | None:
     if workers is not None and scheduler is not None:
         raise InputError("--workers and --scheduler exclude each other: workers of a running scheduler are its own.")
     return workers if scheduler is None else scheduler
-
-
-def interrupt_once() -> None:
-    """End a run in order at Ctrl-C or a batch system's SIGTERM; ignore a second one."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        for name in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(name, signal.SIG_IGN)
-        raise KeyboardInterrupt
-
-    for name in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(name, interrupt)
 
 
 def picture(asked: Path | None, shown: str | Path, end: str = "") -> Path:

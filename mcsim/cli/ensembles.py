@@ -1,14 +1,13 @@
 """Commands for ensembles: run, join, inspect, draw, predict."""
 
 import os
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from typer import Argument, Option
 
-from mcsim.cli.common import Config, Part, Png, Processes, Scheduler, chosen, interrupt_once, picture, save
+from mcsim.cli.common import Config, Part, Png, Processes, Scheduler, chosen, picture, save
 from mcsim.errors import InputError
 from mcsim.support.loading import loaded
 
@@ -38,14 +37,8 @@ def run(
 
         print(plan.describe(config, part, workers))
         return
-    interrupt_once()
-    try:
-        runner = loaded("mcsim.ensemble.runner")
-        result = runner.run(config, store, resume=resume, realizations=part, workers=where, quiet=False)
-    except KeyboardInterrupt:
-        print("mcsim: interrupted; run the same command again to continue.", file=sys.stderr)
-        raise typer.Exit(130) from None
-    _report(result)
+    runner = loaded("mcsim.ensemble.runner")
+    _report(runner.run(config, store, resume=resume, realizations=part, workers=where, quiet=False))
 
 
 def merge(
@@ -146,12 +139,7 @@ def maps(
     if realization is not None and realizations is not None:
         raise InputError("--realization and --realizations exclude each other; give one of them.")
     chosen = _slice(realizations) if realization is None else realization
-    interrupt_once()
-    try:
-        found = write_maps(config, folder, chosen, sample_by_sample=sample_by_sample, quiet=False)
-    except KeyboardInterrupt:
-        print("mcsim: interrupted; folders that exist are complete.", file=sys.stderr)
-        raise typer.Exit(130) from None
+    found = write_maps(config, folder, chosen, sample_by_sample=sample_by_sample, quiet=False)
     print(f"wrote maps of {len(found)} realization{'' if len(found) == 1 else 's'} to {folder}")
 
 

@@ -257,7 +257,10 @@ def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool
     size, settings = len(analysis.elements), analysis.settings
     few, source = settings.pilot_sims_per_element * size, analysis.source
     if source is not None and source.count is not None and source.count <= size:
-        raise _too_few(source, size, settings.sims_per_element)
+        raise InputError(
+            f"{source.count} realizations of {source.label} are too few for a data vector of {size} elements; give "
+            f"more than {size}, {settings.sims_per_element} for each independent one, or leave effects out (--without)."
+        )
     # What is needed in any case keeps workers busy to the end of the pilot; external simulations wait for its verdict.
     first = run([one for one in jobs if (one.number < few if one.kind == "null" else source is None)])
     drawn = np.concatenate([result[:, :size] for purpose, result in first.items() if purpose.kind == "null"])

@@ -129,10 +129,13 @@ def agreement(found: Agreement) -> str:
 
 
 def chi2(result: DiagnosisResult) -> str:
-    """Return the unbiased chi^2 of the data vector, its degrees of freedom and the global p-value."""
+    """Return the unbiased chi^2 of the data vector, its degrees of freedom and the global p-value.
+
+    This is of chi^2 or of the most significant candidate, whichever is less likely, look-elsewhere effect included.
+    """
     dof = result.test.dimension
     value = number(result.excess.value + dof, 4)
-    return f"χ² = {value} for {dof} degrees of freedom; global {p_equals(result.test.pvalue)}"
+    return f"χ² = {value} for {dof} degrees of freedom; global {p_equals(result.test.pvalue)} (χ² and all candidates)"
 
 
 def residual(pvalue: float) -> str:

@@ -58,7 +58,8 @@ def open_summary(path: str | Path) -> "xr.Dataset":
     -------
     xarray.Dataset
         ``biposh_mean``, ``biposh_standard_error``, ``biposh_standard_deviation``, the same ``_binned``, of ``cl`` and,
-        if the run is paired, of ``_circular`` and ``_difference``; uK^2.
+        if the run is paired, of ``_circular`` and ``_difference``; uK^2. Errors and deviations of complex numbers are
+        those of both parts together, sqrt(re^2 + im^2).
 
     Raises
     ------

@@ -378,7 +378,7 @@ def test_what_cannot_be_a_simulator(tmp_path, monkeypatch):
 
 def test_small_ensembles_are_refused_with_the_number_that_is_needed(tmp_path):
     stack = native(1, 60)
-    with refused("60", "189", "3", "--without"):
+    with refused("60", "63", "3", "--without"):
         mcsim.diagnose(mcsim.ExternalModel(MODEL, stack), list(stack[0]), settings=SETTINGS)
     with refused("200", "60"):
         few = replace(SETTINGS, simulations=200)

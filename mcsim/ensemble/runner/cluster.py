@@ -48,6 +48,7 @@ _KEPT_MEMORY = {f"MALLOC_{limit}_THRESHOLD_": str(2**28) for limit in ("TRIM", "
 the system each time, and new pages cost nearly as much as the transforms."""
 
 QUIET = {
+    "distributed.admin.large-graph-warning-threshold": "1 GB",  # data of a challenge go with its tasks
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.tick.cycle": "10s",
