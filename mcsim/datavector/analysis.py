@@ -333,12 +333,10 @@ def _seed_and_added(simulated: str, fiducial: str) -> tuple[int, tuple[config.Ef
 def surveys(job: Job, library: Library | None = None) -> Iterator[tuple[int, Survey]]:
     """Yield every realization of a job with its survey: the same for all, but for the nuisances that each draws."""
     kinds = job.library if library is None else kinds_of(library)
-    disturbed = _disturbed(job.simulated, kinds, job.content) if job.nuisances else None
+    known = job.simulated, kinds, job.content
+    disturbed = _disturbed(*known) if job.nuisances else None
     for realization in range(job.first, job.first + job.count):
-        yield (
-            realization,
-            _survey(job.simulated, kinds, job.content) if disturbed is None else disturbed.at(realization),
-        )
+        yield realization, _survey(*known) if disturbed is None else disturbed.at(realization)
 
 
 @lru_cache(maxsize=1)
