@@ -47,7 +47,8 @@ class Command(TyperCommand):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            print("mcsim: interrupted; run the same command again to continue.", file=sys.stderr)
+            again = "mcsim run and diagnose go on with it when they are called again"
+            print(f"mcsim: interrupted; what is finished is kept: {again}.", file=sys.stderr)
             raise Exit(130) from None
 
 
