@@ -105,7 +105,8 @@ class ChannelResult:
             return f"{self.name}: identical to an accuracy of {number(self.accuracy)} ({number(self.rms_uk)} uK rms)."
         if self.verdict == "unknown":
             near, share = " and ".join(d.name for d in self.nearest), self.nearest_explains
-            hint = f"; nearest is {near}, which explains {100 * share:.0f} %" if near and share >= 0.01 else ""
+            part = f"{100 * share:.0f}" if share < 0.99 else f"{100 * min(share, 0.9999):.2f}"
+            hint = f"; nearest is {near}, which explains {part} %" if near and share >= 0.01 else ""
             if self.unmade_rms_uk > 0.2 * self.rms_uk:
                 hint += (
                     f". The model makes side A itself to {number(self.unmade_rms_uk)} uK rms only: "
@@ -115,7 +116,8 @@ class ChannelResult:
                 hint += ". Without a model only differences of the maps themselves are tried: give one"
             looks = f" What is left is {'; '.join(self.looks)}." if self.looks else ""
             return (
-                f"{self.name}: different by {size}, in a way that no difference of the library explains{hint}.{looks}"
+                f"{self.name}: different by {size}, in a way that no difference of the library explains in full{hint}."
+                f"{looks}"
             )
         named = " and ".join(d.words for d in self.differences)
         others = [" and ".join(d.words for d in one) for one in self.alternatives]
