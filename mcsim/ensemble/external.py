@@ -88,6 +88,8 @@ def source_of(run: config.RunConfig, given: Any) -> Source:
         if ":" not in os.path.basename(text):
             if not os.path.exists(text):
                 raise InputError(f"{text} does not exist; give stored maps, or a simulator as package.module:name.")
+            if text.endswith(".py"):
+                raise InputError(f"{text} is a file of code; say which function or class simulates, {text}:NAME.")
             return StoredMaps(parts, Path(text).name, path=os.path.abspath(text))
         made = cloudpickle.dumps(partial(_resolved, text, config.to_json(run), _written(text.rpartition(":")[0])))
         # The run is a part of what tells diagnoses apart already.
@@ -149,9 +151,9 @@ def _loaded(made: bytes) -> Any:
 def _method(simulator: Any) -> Callable[..., Any]:
     found = getattr(simulator, "simulate", simulator)
     if not callable(found):
-        raise InputError(
-            f"{simulator!r} is no simulator; give a function or an object with simulate(seed, effects=())."
-        )
+        shown = repr(simulator)
+        shown = f"a {type(simulator).__name__}" if " at 0x" in shown else shown
+        raise InputError(f"{shown} is no simulator; give a function or an object with simulate(seed, effects=()).")
     return found
 
 

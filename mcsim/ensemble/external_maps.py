@@ -88,7 +88,7 @@ def in_order(given: Any, parts: Sequence[Part], where: str) -> list[Map]:
     missing = [part.name for part in parts if part.name not in found]
     if missing:
         there = ", ".join(":".join(labels) or "an unnamed map" for labels, _ in _flat(given)) or "none"
-        raise InputError(f"{where} lacks the map {missing[0]}; it has {there}.")
+        raise InputError(f"{where} lacks the map {missing[0]}; it has {there}. Give maps by name.")
     return [found[part.name] for part in parts]
 
 

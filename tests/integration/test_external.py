@@ -353,13 +353,20 @@ def test_what_cannot_be_a_simulator(tmp_path, monkeypatch):
     run = config.load(MODEL)
     no_seed, cannot = (lambda: None), (lambda seed: None)
     cannot.effects = ("beam_width",)
-    for name in ("one1.fits", "a1.fits"):
+
+    class Code:
+        def __init__(self, name):
+            self.name = name
+
+    for name in ("one1.fits", "a1.fits", "mine.py"):
         (tmp_path / name).touch()
     for given, words in (
         ("no_such_module:thing", ("no_such_module", "ModuleNotFoundError")),
         (str(tmp_path / "none.py") + ":Thing", (str(tmp_path / "none.py"),)),
         ("math:pi", ("3.141592653589793",)),
+        (Code("its own"), ("Code",)),
         ("only_a_name", ("package.module:name", "only_a_name")),
+        (str(tmp_path / "mine.py"), (str(tmp_path / "mine.py") + ":NAME",)),
         (str(tmp_path / "{realization}.fits"), ("{realization}", tmp_path)),
         (str(tmp_path / "{realisation}.fits"), ("{realisation}", "{realization}")),
         (str(tmp_path / "one{realization}.fits"), ("{channel}", "{split}")),
