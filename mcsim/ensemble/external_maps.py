@@ -7,7 +7,6 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from string import Formatter
 from typing import Any, NamedTuple
@@ -22,6 +21,7 @@ from mcsim.sphere import header
 from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Alm, Map, reals
 from mcsim.support.folders import unreadable
+from mcsim.support.loading import once_per_content
 
 
 class Part(NamedTuple):
@@ -164,7 +164,7 @@ class StoredMaps(Source):
     def _opened(self) -> Any:
         """Return an array of the maps of a .npy file, or the dataset of a store."""
         if not self.path.endswith(".npy"):
-            return _zarr(self.path, os.stat(self.path).st_mtime_ns)
+            return _zarr(self.path)
         found = np.load(self.path, mmap_mode="r")
         if found.ndim != 3 or found.shape[1] != len(self.parts):
             raise InputError(
@@ -222,8 +222,8 @@ def fits_maps(parts: tuple[Part, ...], template: str) -> FitsMaps:
     return FitsMaps(parts, found.label, template=found.template, realizations=tuple(numbers))
 
 
-@lru_cache(maxsize=1)
-def _zarr(path: str, written_ns: int) -> Any:
+@once_per_content(1)
+def _zarr(path: str) -> Any:
     """Open a store once for all realizations, and again if it was written anew."""
     import xarray as xr
 

@@ -40,8 +40,7 @@ def check_settings(settings: Any, shares: Iterable[str] = (), least: Mapping[str
             raise InputError(f"{field.name} = {value!r} is neither True nor False; give one of them.")
         if isinstance(default, int | float) and not isinstance(default, bool):
             smallest, largest = least.get(field.name, 0), 1.0 if field.name in bounded else math.inf
-            number = isinstance(value, int | float) and not isinstance(value, bool) and smallest <= value <= largest
-            if not number or (isinstance(default, int) and value != int(value)):
+            if not _is_like(value, default, smallest, largest):
                 kind = "a whole number" if isinstance(default, int) else "a number"
                 limit = "from 0 to 1" if largest == 1.0 else f"of {smallest} or more"
                 raise InputError(f"{field.name} = {value!r} is out of range; give {kind} {limit}.")
@@ -49,7 +48,13 @@ def check_settings(settings: Any, shares: Iterable[str] = (), least: Mapping[str
 
 def _check_items(name: str, values: Iterable[Any], default: float, smallest: float) -> None:
     """Raise InputError unless there are values, each a number like the default one and no less than the smallest."""
-    kind = "whole numbers" if isinstance(default, int) else "numbers"
-    found = [isinstance(one, int | float) and not isinstance(one, bool) and one >= smallest for one in values]
-    if not found or not all(found) or (isinstance(default, int) and any(one != int(one) for one in values)):
+    kind, found = "whole numbers" if isinstance(default, int) else "numbers", list(values)
+    if not found or not all(_is_like(one, default, smallest) for one in found):
         raise InputError(f"{name} = {values!r} does not do; give {kind} of {smallest} or more.")
+
+
+def _is_like(value: Any, default: float, smallest: float, largest: float = math.inf) -> bool:
+    """Return True for a number within bounds, both included, that is whole if the default one is."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not smallest <= value <= largest:
+        return False
+    return not isinstance(default, int) or float(value).is_integer()

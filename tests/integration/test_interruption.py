@@ -1,36 +1,39 @@
 """Commands that are interrupted, and warnings of the command line: a sentence, and the exit code that is documented."""
 
-import os
-import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
 from mcsim.support import resources
 
+INTERRUPTED = """
+import signal, sys
+import mcsim.cli
+from mcsim.ensemble import {module}
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("command", [["maps", "quickstart", "-o", "here"], ["predict", "quickstart", "--exact"]])
-def test_any_command_ends_in_a_sentence(tmp_path, command, number) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mcsim.cli", *command], cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
-    )
-    status, handled = f"/proc/{process.pid}/status", 0
-    if not os.path.exists(status):
-        process.kill()
-        pytest.skip("no list of the signals that a process handles")
-    for _ in range(600):  # until the command handles the signal
-        time.sleep(0.05)
-        with open(status) as stream:
-            handled = int(next(line for line in stream if line.startswith("SigCgt")).split()[1], 16)
-        if handled >> (signal.SIGTERM - 1) & 1:
-            break
-    process.send_signal(number)
-    _, said = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert said.decode().splitlines()[-1].startswith("mcsim: interrupted")
+{module}.{function} = lambda *given, **named: signal.raise_signal(signal.{name})
+sys.argv = ["mcsim", *{command!r}]
+mcsim.cli.main()
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize(
+    ("module", "function", "command"),
+    [
+        ("maps", "write_maps", ["maps", "tiny", "-o", "here"]),
+        ("prediction", "predict", ["predict", "tiny"]),
+        ("runner", "run", ["run", "tiny"]),
+    ],
+)
+def test_any_command_ends_in_a_sentence(tmp_path, module, function, command, name) -> None:
+    """The function that does the work is interrupted as soon as it is called."""
+    program = INTERRUPTED.format(module=module, function=function, command=command, name=name)
+    found = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert found.returncode == 130
+    [line] = found.stderr.splitlines()
+    assert line.startswith("mcsim: interrupted; what is finished is kept")
 
 
 def test_a_warning_of_mcsim_is_a_sentence(tmp_path) -> None:

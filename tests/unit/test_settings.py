@@ -14,6 +14,7 @@ from refusals import refused
         (DiagnosisSettings, "simulations", -1),
         (DiagnosisSettings, "simulations", "100"),
         (DiagnosisSettings, "simulations", 100.5),
+        (DiagnosisSettings, "simulations", float("inf")),
         (DiagnosisSettings, "controls", -1),
         (DiagnosisSettings, "alpha", 5),
         (DiagnosisSettings, "residual_level", 2.0),
