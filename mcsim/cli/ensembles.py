@@ -132,7 +132,8 @@ def maps(
 ) -> None:
     """Write the maps of a run as FITS files, which mcsim diagnose can read.
 
-    A folder for each realization holds CHANNEL.fits or CHANNEL_SPLIT.fits: HEALPix in RING order, uK.
+    A folder for each realization holds CHANNEL.fits or CHANNEL_SPLIT.fits: HEALPix in RING order, uK. Those that an
+    interrupted command has written are kept: give it again, and it goes on.
     """
     from mcsim.ensemble.maps import write_maps
 
@@ -140,7 +141,7 @@ def maps(
         raise InputError("--realization and --realizations exclude each other; give one of them.")
     chosen = _slice(realizations) if realization is None else realization
     found = write_maps(config, folder, chosen, sample_by_sample=sample_by_sample, quiet=False)
-    print(f"wrote maps of {len(found)} realization{'' if len(found) == 1 else 's'} to {folder}")
+    print(f"maps of {len(found)} realization{'' if len(found) == 1 else 's'} are in {folder}")
 
 
 def prepare(

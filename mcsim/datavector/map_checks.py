@@ -1,6 +1,7 @@
 """Read observed maps, and refuse maps that a survey cannot have made."""
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations, compress
 from pathlib import Path
 
@@ -62,13 +63,15 @@ def read_maps(model: Model, folder: str | Path) -> list[Map]:
     The folder has ``{channel}.fits``, or ``{channel}_{split}.fits`` where the model has splits: HEALPix in uK (or the
     unit of its header), ``healpy.UNSEEN`` if not observed, in RING order or with a header that says another. InputError
     is raised if a file is missing or unreadable, has another nside, frame or unit, or values that are no map of this
-    survey: not finite, constant, without what the fiducial scan hits, or far from the size of the model.
+    survey: not finite, constant, without what the fiducial scan hits, or far from the size of the model. Other FITS
+    files are not read, which a warning says.
     """
     folder, names = user_path(folder), file_names(model.survey.config)
     if not folder.is_dir():
         first = names[model.parts[0].name]
         raise InputError(f"{folder} is no folder; give one with the observed maps, {first} and so on.")
     maps = [_read(model, part, folder / names[part.name]) for part in model.parts]
+    _warn_of_others(path.name for path in folder.glob("*.fits*") if path.name not in names.values())
     _check_differ(model, maps, [str(folder / names[part.name]) for part in model.parts])
     return maps
 
@@ -91,6 +94,7 @@ def checked(model: Model, maps: Sequence[Map] | Mapping[str, Map]) -> list[Map]:
         lacking = [name for name in names if name not in maps]
         if lacking:
             raise InputError(f"the maps lack {lacking[0]}; the model has {', '.join(names)}.")
+        _warn_of_others(str(name) for name in maps if name not in names)
         maps = [maps[name] for name in names]
     if not isinstance(maps, Sequence | np.ndarray):
         raise InputError(f"the maps are a {type(maps).__name__}; give a folder, or arrays for {', '.join(names)}.")
@@ -103,6 +107,17 @@ def checked(model: Model, maps: Sequence[Map] | Mapping[str, Map]) -> list[Map]:
     ]
     _check_differ(model, found, [name for _, name in named])
     return found
+
+
+def _warn_of_others(names: Iterable[str]) -> None:
+    """Warn of what stands beside the maps, and may be one that the model should have."""
+    if found := sorted(names):
+        more = "" if len(found) < 4 else f" and {len(found) - 3} more"
+        warnings.warn(
+            f"{', '.join(found[:3])}{more} in the data will not be looked at: no map of the model has that name; if it "
+            "is an observed map, give the model its channel or split.",
+            stacklevel=3,
+        )
 
 
 def _check_differ(model: Model, maps: Sequence[Map], names: Sequence[str]) -> None:

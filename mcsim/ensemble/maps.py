@@ -1,6 +1,7 @@
 """Maps of a run as FITS files, which :func:`mcsim.diagnose` can read."""
 
 import os
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere.checks import check_whole
-from mcsim.support.folders import appearing, unwritable, user_path, writable
+from mcsim.sphere.header import first_table, opened
+from mcsim.support.folders import appearing, unreadable, unwritable, user_path, writable
 from mcsim.support.progress import reporting
 
 POINTING: dict[bool, tuple[str, Any]] = {False: ("POINTING", "pixel means"), True: ("POINTING", "samples")}
@@ -41,8 +43,8 @@ def write_maps(
     folder
         Output folder; it is made if it does not exist.
     realizations
-        A number: this one, its files directly in ``folder``, which must be new or empty. A slice, or None for the
-        whole ensemble: a subfolder for each, ``00000`` and so on.
+        A number: this one, its files directly in ``folder``. A slice, or None for the whole ensemble: a subfolder for
+        each, ``00000`` and so on.
     sample_by_sample
         Use the time-ordered reference: each map is the plain mean of its samples, whose pointing must be known. Sky
         and effects are those of the default route; the noise is another draw.
@@ -66,7 +68,8 @@ def write_maps(
 
     Notes
     -----
-    A folder appears complete or not at all. Memory is that of one realization.
+    A folder appears complete or not at all. One that an earlier call has written for the same run is kept, so that an
+    interrupted call goes on where it was; nothing else is written over. Memory is that of one realization.
 
     Examples
     --------
@@ -95,9 +98,12 @@ def write_maps(
     targets = {r: whole if alone else whole / f"{r:05d}" for r in wanted}
     if whole.exists() and not whole.is_dir():
         raise InputError(f"{folder} is a file; choose a folder with -o.")
-    for target in targets.values():
-        if target.exists() and (not target.is_dir() or any(target.iterdir())):
-            raise InputError(f"{target} is not empty, and nothing is written over; choose another folder with -o.")
+    alike = [("DIGEST", config.digest(run)), POINTING[sample_by_sample]]
+    missing = {
+        r: target for r, target in targets.items() if not _written(target, names.values(), [*alike, ("REALIZ", r)])
+    }
+    if not missing:
+        return list(targets.values())
     config.check_skies(run, wanted)
     threads = nthreads or os.cpu_count() or 1
     with reporting("orientation moments", 1.0, "", quiet) as report:
@@ -108,18 +114,36 @@ def write_maps(
     simulate.draw_sky(shared, wanted.start)  # finds bad sky files before a folder is made
     writable(whole if not alone else whole.absolute().parent)
     ascii_name = run.name.encode("ascii", "backslashreplace").decode()  # as FITS headers require
-    header = [("RUN", ascii_name), ("DIGEST", config.digest(run)), POINTING[sample_by_sample]]
-    with reporting("maps", float(len(wanted)), "realizations", quiet) as report:
-        for number, (r, target) in enumerate(targets.items()):
+    with reporting("maps", float(len(missing)), "realizations", quiet) as report:
+        for number, (r, target) in enumerate(missing.items()):
             if sample_by_sample:
                 made = dict(sampled.maps(shared, r, threads))
             else:
                 made = dict(zip(shared.map_names, simulate.maps(shared, r, threads), strict=True))
             with unwritable(target, "choose another folder with -o"), appearing(target) as scratch:
+                header = [("RUN", ascii_name), *alike, ("REALIZ", r)]
                 for name, map_uk in made.items():
-                    write_map(scratch / names[name], map_uk, shared.frame, [*header, ("REALIZ", r)])
+                    write_map(scratch / names[name], map_uk, shared.frame, header)
             report(number + 1.0)
     return list(targets.values())
+
+
+def _written(target: Path, names: Iterable[str], wanted: Sequence[tuple[str, Any]]) -> bool:
+    """Return True if a folder has the maps of an earlier call, False if it is new; else raise InputError."""
+    remedy = "choose another folder with -o"
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+        return False
+    if not target.is_dir() or sorted(names) != sorted(file.name for file in target.iterdir()):
+        raise InputError(f"{target} is not empty, and nothing is written over; {remedy}.")
+    for path in target.iterdir():
+        with unreadable(path, "a map", remedy), opened(path) as hdus:
+            found = first_table(hdus).header
+        other = next((key for key, value in wanted if found.get(key) != value), None)
+        if other is not None:
+            raise InputError(
+                f"{path} is of another run (its {other} is {found.get(other)}), and nothing is written over; {remedy}."
+            )
+    return True
 
 
 def write_map(path: Path, map_uk: NDArray[np.float64], frame: str, header: list[tuple[str, Any]] | None = None) -> None:

@@ -125,11 +125,17 @@ def test_what_cannot_be_written_is_refused_before(
 def test_nothing_is_written_over_and_nothing_is_left_half(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run, folder = table(**ensemble(3)), tmp_path / "x"
     write_maps(run, folder, slice(1, 2))
-    before = (folder / "00001" / "W1.fits").read_bytes()
-    for chosen in (None, slice(1, 3), 0):
-        with refused(folder if chosen != slice(1, 3) else folder / "00001", "-o"):
-            write_maps(run, folder, chosen)
-    assert (folder / "00001" / "W1.fits").read_bytes() == before
+    file = folder / "00001" / "W1.fits"
+    before = file.read_bytes()
+    with refused(folder, "-o"):
+        write_maps(run, folder, 0)
+    with refused(file, "DIGEST", "-o"):
+        write_maps(table(**ensemble(3, seed=9)), folder)
+    (folder / "00001" / "notes.txt").write_text("mine")
+    with refused(folder / "00001", "-o"):
+        write_maps(run, folder)
+    (folder / "00001" / "notes.txt").unlink()
+    assert file.read_bytes() == before
 
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
@@ -143,14 +149,30 @@ def test_nothing_is_written_over_and_nothing_is_left_half(tmp_path: Path, monkey
     assert not (tmp_path / "y").exists()
 
 
+def test_an_interrupted_call_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, folder, made = table(**ensemble(3)), tmp_path / "x", []
+    write_maps(run, folder, slice(0, 2))
+    before = [(folder / f"{r:05d}" / "W1.fits").stat().st_mtime_ns for r in range(2)]
+    (folder / "00000" / "W1.fits").rename(tmp_path / "broken")
+    (folder / "00000" / "W1.fits").write_bytes((tmp_path / "broken").read_bytes()[:3000])
+    with refused(folder / "00000" / "W1.fits", "-o"):
+        write_maps(run, folder)
+    (tmp_path / "broken").replace(folder / "00000" / "W1.fits")
+    monkeypatch.setattr(simulate, "maps", lambda _, r, threads, own=simulate.maps: made.append(r) or own(_, r, threads))
+    assert write_maps(run, folder) == [folder / f"{r:05d}" for r in range(3)]
+    assert made == [2]
+    assert [(folder / f"{r:05d}" / "W1.fits").stat().st_mtime_ns for r in range(2)] == before
+
+
 def test_the_command(mcsim: Command, tmp_path: Path) -> None:
     toml = tmp_path / "small.toml"
     toml.write_text(SMALL)
     assert mcsim("maps", "small.toml", "-o", "one", "--realization", 4)[0] == 0
     assert mcsim("maps", "small.toml", "-o", "some", "--realizations", "4:6")[0] == 0
     assert (tmp_path / "one" / "W1.fits").read_bytes() == (tmp_path / "some" / "00004" / "W1.fits").read_bytes()
+    assert mcsim("maps", "small.toml", "-o", "one", "--realization", 4)[0] == 0  # they are there
     for words in (
-        ("small.toml", "-o", "one", "--realization", 4),
+        ("small.toml", "-o", "one", "--realization", 5),
         ("small.toml", "-o", "x", "--realization", 4, "--realizations", "4:6"),
         ("small.toml", "-o", "x", "--realization", 10),
         ("small.toml", "-o", "x", "--realizations", "6:4"),

@@ -11,7 +11,7 @@ import mcsim
 from instruments import data_of, two_channels
 from mcsim import config, systematics
 from mcsim.datavector.analysis import Analysis, analysis_of
-from mcsim.datavector.map_checks import read_maps
+from mcsim.datavector.map_checks import checked, read_maps
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import model_of
 from mcsim.diagnosis import api
@@ -132,3 +132,12 @@ def test_a_missing_file_is_named(small, folder):
     (folder / "W1_half2.fits").unlink()
     with refused("W1_half2.fits", "W1:half2"):
         read_maps(small.model, folder)
+
+
+def test_a_map_that_the_model_has_not_is_told(small, folder):
+    shutil.copy(folder / "V1_half1.fits", folder / "W7_half1.fits")
+    with pytest.warns(UserWarning, match="W7_half1.fits"):
+        maps = read_maps(small.model, folder)
+    named = dict(zip((part.name for part in small.model.parts), maps, strict=True))
+    with pytest.warns(UserWarning, match="W7:half1"):
+        assert len(checked(small.model, named | {"W7:half1": maps[0]})) == len(maps)
