@@ -30,7 +30,6 @@ from mcsim.support.arrays import Vector
 from mcsim.support.folders import appearing, writable
 from mcsim.support.progress import reporting
 
-EPSILON = 1e-7  #: error of the interpolation of samples, relative to the dipole: 0.3 nK
 SMALLER = 0.7  #: factor between one trial of an amplitude and the next
 
 ATTEMPTS = 16
@@ -107,7 +106,7 @@ def maps_of(run: config.RunConfig, truth: Truth, file: str | None = None) -> lis
     data = seeded(with_effects(run, acting), truth.seed)
     shared = survey(data, library=library_with(file))
     if truth.sampled:
-        return sampled.maps(shared, 0, epsilon=EPSILON)
+        return sampled.maps(shared, 0)
     return list(zip(shared.map_names, simulate.maps(shared, 0), strict=True))
 
 

@@ -11,7 +11,7 @@ from mcsim import config
 from mcsim.comparison.description import quiet
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.scene import EPSILON, Maps, Scene
+from mcsim.comparison.scene import Maps, Scene
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
@@ -109,7 +109,7 @@ class EffectDifference(Difference):
         def made(run: config.RunConfig) -> Maps:
             run = replace(run, sky=replace(run.sky, spectrum=None, map=None, alm=sky))
             whole = _with_samples_of(scene, _survey(run, scene))
-            return np.stack([m for _, m in sampled.maps(whole, 0, scene.nthreads, EPSILON)])
+            return np.stack([m for _, m in sampled.maps(whole, 0, scene.nthreads)])
 
         alone, acting = self._runs(self._effect(value), scene, pair, scene.beam)
         try:

@@ -13,7 +13,6 @@ from mcsim.simulation.survey import Survey, survey
 from refusals import refused
 
 NSIDE = 16
-EPSILON = 1e-7
 """Of the interpolation, relative to the dipole: 0.3 nK."""
 
 
@@ -54,7 +53,7 @@ def prepared(
 def plain(nside: int = NSIDE, denser: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Maps of both routes without effects."""
     run = prepared(nside=nside, denser=denser)
-    ((name, map_uk),) = sampled.maps(run, 0, epsilon=EPSILON)
+    ((name, map_uk),) = sampled.maps(run, 0)
     assert (name,) == run.map_names
     return simulate.maps(run, 0)[0], map_uk
 
@@ -93,7 +92,7 @@ def test_both_routes_respond_alike(name):
     parameters, without = RESPONSES[name], plain(denser=denser)
     changed = prepared(name, denser=denser, **parameters)
     default = simulate.maps(changed, 0)[0] - without[0]
-    reference = sampled.maps(changed, 0, epsilon=EPSILON)[0][1] - without[1]
+    reference = sampled.maps(changed, 0)[0][1] - without[1]
     product = default @ reference / np.sqrt((default @ default) * (reference @ reference))
     amplitude = default @ reference / (default @ default)
     print(f"{name}: rms {np.std(reference):.3f} uK, cosine {product:.5f}, sampled over default {amplitude:.4f}")
@@ -109,7 +108,7 @@ def test_a_beam_with_all_of_its_orders_back_is_the_beam():
     restored = prepared("beam_noncircularity", beam=fiducial, dipole_uk=0.0, amplitude=1.0)
     for route in (
         lambda one: simulate.maps(one, 0)[0],
-        lambda one: sampled.maps(one, 0, epsilon=EPSILON)[0][1],
+        lambda one: sampled.maps(one, 0)[0][1],
     ):
         expected, found, without = (route(one) for one in (whole, restored, circular))
         assert np.std(expected - without) > 0.1
@@ -122,7 +121,7 @@ def test_samples_at_the_centres_lose_window_and_centroid():
     Without a dipole: it is taken off with the fiducial window.
     """
     without, changed = plain(nside=32), prepared("pixelization", dipole_uk=0.0, nside=32, amplitude=1.0)
-    centred = [simulate.maps(changed, 0)[0], sampled.maps(changed, 0, epsilon=EPSILON)[0][1]]
+    centred = [simulate.maps(changed, 0)[0], sampled.maps(changed, 0)[0][1]]
     default, reference = (map_uk - plain for map_uk, plain in zip(centred, without, strict=True))
     assert default @ reference / np.sqrt((default @ default) * (reference @ reference)) > 0.96
     assert default @ reference / (default @ default) == pytest.approx(1.0, abs=0.02)
