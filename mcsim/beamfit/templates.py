@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mcsim.beamfit.data import Measurement, project
 from mcsim.beamfit.models import Model
-from mcsim.bipolar.theory import ScannedBeam, cmb_biposh_exact, cmb_biposh_leading
+from mcsim.bipolar.theory import ScannedBeam
 from mcsim.ensemble import expectation
 from mcsim.errors import InputError
 from mcsim.simulation.survey import Survey
@@ -49,7 +49,8 @@ class Templates:
     """Prediction of binned data for a survey's beams with b_l2 times f_l.
 
     The measurement defines the bins, ``pair`` the indices of the maps; ``beams`` are those of these maps, with moments
-    of high degree. ``known`` keeps the exact data computed so far, by f_l: nested models share them.
+    of high degree. ``known`` keeps the exact data computed so far, by f_l: nested models share them. ``control``: the
+    coefficients of the circular-beam control, which paired differences are without.
     """
 
     measured: Measurement
@@ -57,17 +58,19 @@ class Templates:
     pair: tuple[int, int]
     beams: tuple[ScannedBeam, ScannedBeam]
     nthreads: int = 1
+    control: NDArray[np.complex128] | None = None
     known: dict[bytes, NDArray[np.float64]] = field(default_factory=dict, repr=False)
 
-    def data(self, factor: NDArray, L_moments: int | None) -> NDArray[np.float64]:
-        """Return data, shape (p,), for f_l at l = 0, 1, ...: to all orders with ``L_moments``, else to the leading."""
+    def data(self, factor: NDArray, exact: bool = False, L_moments: int | None = None) -> NDArray[np.float64]:
+        """Return data, shape (p,), for f_l at l = 0, 1, ...: to all orders in the beam if ``exact``, else to leading.
+
+        The moments of the scan are taken up to ``L_moments``; default: up to those that are known.
+        """
         x, y = (_rescaled(beam, factor, L_moments) for beam in self.beams)
-        modes, cl, lmax = self.measured.modes, expectation.spectrum(self.survey), self.survey.lmax
-        if L_moments is None:
-            seen = cmb_biposh_leading(modes, cl, lmax, x, y)
-        else:
-            seen = cmb_biposh_exact(modes, cl, lmax, x, x if self.pair[0] == self.pair[1] else y, self.nthreads)
-        seen = expectation.without_windows(self.survey, seen, modes, self.pair)
+        modes = self.measured.modes
+        seen = expectation.signal(self.survey, (x, y), self.pair, modes, exact, self.nthreads)
+        if self.control is not None:
+            seen = seen - self.control
         if self.measured.kind == "plain" and self.pair[0] == self.pair[1]:
             seen = seen + expectation.noise_mean(self.survey, self.pair[0], modes)
         return project(self.measured.rows, self.measured.scaling, dict(zip(modes, seen, strict=True)))
@@ -79,8 +82,8 @@ class Templates:
     def leading(self, model: Model) -> Polynomial:
         """Return the data to leading order in the beam, which are linear in the parameters."""
         functions = self.functions(model)
-        constant = self.data(0.0 * functions[0], None)
-        linear = np.stack([self.data(function, None) - constant for function in functions], axis=-1)
+        constant = self.data(0.0 * functions[0])
+        linear = np.stack([self.data(function) - constant for function in functions], axis=-1)
         return Polynomial(constant, linear, np.zeros((*linear.shape, len(functions))))
 
     def exact(self, model: Model) -> Polynomial:
@@ -98,7 +101,7 @@ class Templates:
         def at(factor: NDArray) -> NDArray[np.float64]:
             key = factor.astype(complex).tobytes()
             if key not in self.known:
-                self.known[key] = self.data(factor, expectation.L_MOMENTS)
+                self.known[key] = self.data(factor, exact=True)
             return self.known[key]
 
         constant = at(0.0 * functions[0])
@@ -115,7 +118,7 @@ class Templates:
     def beyond_leading(self, model: Model, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the approximate difference between all orders and the leading one at theta, shape (p,)."""
         factor = theta @ self.functions(model)
-        return self.data(factor, TRIAL_MOMENTS) - self.data(factor, None)
+        return self.data(factor, True, TRIAL_MOMENTS) - self.data(factor, False, TRIAL_MOMENTS)
 
 
 def templates(survey: Survey, measured: Measurement, nthreads: int = 1) -> Templates:
@@ -129,12 +132,16 @@ def templates(survey: Survey, measured: Measurement, nthreads: int = 1) -> Templ
             f"the data reach ell = {measured.lmax}, the configuration ends at {survey.lmax}; raise its lmax."
         )
     pair = _maps_of(survey, measured.pair)
-    beams = expectation.scanned_beams(survey, expectation.L_MOMENTS, nthreads)
+    beams = expectation.scanned_beams(survey, expectation.moments_needed(survey, exact=True), nthreads)
     x, y = (beams[number] for number in pair)
     if x.smax < 2 or y.smax < 2:
         raise InputError(f"a beam of {survey.config.name} is circular, so it has no b_l2 to rescale; give its shape.")
-    made = Templates(measured, survey, pair, (x, y), nthreads)
-    expected = made.data(np.ones(x.blm.shape[1]), None)
+    control = None
+    if measured.kind == "difference":
+        circular = x.circular, y.circular
+        control = expectation.signal(survey, circular, pair, measured.modes, exact=False, nthreads=nthreads)
+    made = Templates(measured, survey, pair, (x, y), nthreads, control)
+    expected = made.data(np.ones(x.blm.shape[1]))
     if not np.isfinite(expected).all():
         row = measured.rows[int(np.argmin(np.isfinite(expected)))]
         raise InputError(

@@ -15,6 +15,7 @@ from mcsim.bipolar.theory import (
     ScannedBeam,
     cmb_biposh_exact,
     cmb_biposh_leading,
+    map_harmonics,
     noise_biposh,
     orientation_harmonics,
     parallel_transport_harmonics,
@@ -23,12 +24,15 @@ from mcsim.bipolar.theory.harmonics import spin_functions
 from mcsim.errors import InputError
 from mcsim.simulation import survey as survey_
 from mcsim.simulation.survey import Channel, Survey, SurveyMap
-from mcsim.sphere import alm as alm_
-from mcsim.sphere import healpix
 
 Source = str | Path | Mapping[str, Any] | config.RunConfig | Survey
 
 L_MOMENTS = 64  #: highest degree of the orientation moments in predictions to all orders in the beam
+
+L_WEIGHTS = range(64, 193, 32)
+"""Highest degree of moments times weights: the first that holds :data:`SHARE` of the mean square of the weights."""
+
+SHARE = 0.99
 
 
 @dataclass(frozen=True)
@@ -98,8 +102,46 @@ def _orientations(
         return result
     if isinstance(scan, config.ScanParallelTransport) and m.weight is None and m.preparation is None:
         return parallel_transport_harmonics(smax, L_max, float(np.deg2rad(scan.psi0_deg)))
-    w = np.asarray(m.moments.w[:smax])
-    return orientation_harmonics(w if m.weight is None else w * m.weight**2, L_max, nthreads=nthreads)
+    return orientation_harmonics(np.asarray(m.moments.w[:smax]), L_max, nthreads, m.weight)
+
+
+def moments_needed(survey: Survey, exact: bool, L_moments: int | None = None) -> int:
+    """Return the degree up to which a prediction needs the moments: ``L_moments`` to all orders, and with weights."""
+    weights = [m.weight for m in survey.maps if _weighted(survey, m).weight is not None]
+    if not (exact or weights):
+        return survey.config.biposh.L_max
+    if L_moments is not None:
+        return L_moments
+    shares = [held(weight, L_WEIGHTS[-1]) for weight in weights if weight is not None]
+    return max(
+        (next((L for L in L_WEIGHTS if share[L] >= SHARE), L_WEIGHTS[-1]) for share in shares), default=L_MOMENTS
+    )
+
+
+def held(weight: NDArray[np.float64], L_max: int) -> NDArray[np.float64]:
+    """Return the share of the mean square of weights in degrees up to 0, 1, ..., L_max."""
+    power = np.sum(np.abs(map_harmonics(weight, L_max)) ** 2, axis=1) / (4.0 * np.pi)
+    return np.asarray(np.cumsum(power) / np.mean(weight**2))
+
+
+def signal(
+    survey: Survey,
+    beams: tuple[ScannedBeam, ScannedBeam],
+    pair: tuple[int, int],
+    modes: Sequence[Indices],
+    exact: bool,
+    nthreads: int = 1,
+) -> NDArray[np.complex128]:
+    """Return the mean of the sky seen through beams by a pair of maps (indices), uK^2, shape (mode, lmax + 1).
+
+    It is of leading order in their non-circular part, or of all orders if ``exact``, normalised as the estimates are.
+    """
+    x, y = beams
+    y = x if pair[0] == pair[1] else y
+    summed = cmb_biposh_exact if exact else cmb_biposh_leading
+    found = summed(modes, spectrum(survey), survey.lmax, x, y, nthreads=nthreads)
+    weights = [np.ones(1) if (w := _weighted(survey, survey.maps[i]).weight) is None else w for i in pair]
+    return without_windows(survey, found / np.mean(weights[0] * weights[1]), modes, pair)
 
 
 def means(
@@ -109,21 +151,16 @@ def means(
 
     They are of leading order in the non-circular part of the beams, or of all orders if ``exact``.
     """
-    cl = spectrum(survey)
-    x, y = beams[pair[0]], beams[pair[1]]
-    modes, lmax = survey.estimator.modes, survey.lmax
-    signal = cmb_biposh_leading(modes, cl, lmax, x, y)
-    circular = np.where(np.array([L for L, _, _ in modes])[:, None] == 0, signal, 0.0 * signal)
-    if exact:
-        signal = cmb_biposh_exact(modes, cl, lmax, x, x if pair[0] == pair[1] else y, nthreads=nthreads)
-    signal, circular = (without_windows(survey, array, modes, pair) for array in (signal, circular))
-    noise = np.zeros_like(signal)
+    modes, both = survey.estimator.modes, (beams[pair[0]], beams[pair[1]])
+    seen = signal(survey, both, pair, modes, exact, nthreads)
+    circular = signal(survey, (both[0].circular, both[1].circular), pair, modes, exact=False, nthreads=nthreads)
+    noise = np.zeros_like(seen)
     if pair[0] == pair[1]:
         noise = noise_mean(survey, pair[0], modes)
         repeated = [row for row, mode in enumerate(modes) if not mode.in_auto]
-        for array in (signal, circular, noise):
+        for array in (seen, circular, noise):
             array[repeated] = np.nan
-    return Means(signal, circular, noise)
+    return Means(seen, circular, noise)
 
 
 def spectrum(survey: Survey) -> NDArray[np.float64]:
@@ -147,10 +184,5 @@ def noise_mean(survey: Survey, number: int, modes: Sequence[Indices]) -> NDArray
     if m.noise_uk is None:
         return np.zeros((len(modes), lmax + 1), dtype=np.complex128)
     power = m.noise_uk**2 * nside2pixarea(m.moments.nside)
-    alm = healpix.analysis(power if m.weight is None else power * m.weight**2, L_max, iterations=3)
-    variance = np.zeros((L_max + 1, 2 * L_max + 1), dtype=np.complex128)
-    for M in range(L_max + 1):
-        column = alm[alm_.start(L_max, M) + M : alm_.start(L_max, M) + L_max + 1]
-        variance[M:, L_max - M] = (-1) ** M * column.conj()
-        variance[M:, L_max + M] = column
+    variance = map_harmonics(power if m.weight is None else power * m.weight**2, L_max)
     return without_windows(survey, noise_biposh(modes, variance, lmax), modes, (number, number))

@@ -71,10 +71,10 @@ def predicted_once() -> Iterator[None]:
     known: dict[tuple[object, ...], np.ndarray] = {}
     predict = Templates.data
 
-    def data(own: Templates, factor: np.ndarray, L_moments: int | None) -> np.ndarray:
-        key = (own.measured.rows, own.measured.kind, factor.astype(complex).tobytes(), L_moments)
+    def data(own: Templates, factor: np.ndarray, exact: bool = False, L_moments: int | None = None) -> np.ndarray:
+        key = (own.measured.rows, own.measured.kind, factor.astype(complex).tobytes(), exact, L_moments)
         if key not in known:
-            known[key] = predict(own, factor, L_moments)
+            known[key] = predict(own, factor, exact, L_moments)
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -7,7 +7,7 @@ each checks the other.
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh
 from mcsim.bipolar.theory.cmb_biposh import cmb_biposh_exact, cmb_biposh_leading, noise_biposh
 from mcsim.bipolar.theory.detectability import Spectra, fisher_information, isotropic_variance, signal_to_noise
-from mcsim.bipolar.theory.harmonics import orientation_harmonics, parallel_transport_harmonics
+from mcsim.bipolar.theory.harmonics import map_harmonics, orientation_harmonics, parallel_transport_harmonics
 
 __all__ = [
     "ScannedBeam",
@@ -17,6 +17,7 @@ __all__ = [
     "cmb_biposh_leading",
     "fisher_information",
     "isotropic_variance",
+    "map_harmonics",
     "noise_biposh",
     "orientation_harmonics",
     "parallel_transport_harmonics",

@@ -24,7 +24,8 @@ class ScannedBeam:
     """
 
     blm: NDArray[np.complex128]  #: b_lm of the beam at the pole, complex, shape (mmax + 1, lmax + 1), ``blm[m, l]``
-    #: w_{s,LM}, shape (smax + 1, L_max + 1, 2 L_max + 1), as :mod:`mcsim.bipolar.theory.harmonics` makes them
+    #: w_{s,LM}, shape (smax + 1, L_max + 1, 2 L_max + 1), as :mod:`mcsim.bipolar.theory.harmonics` makes them: s = 0
+    #: has the weights of the pixels
     w: NDArray[np.complex128]
 
     def __post_init__(self) -> None:
@@ -42,6 +43,16 @@ class ScannedBeam:
         check_whole(lmax, "lmax")
         if self.blm.shape[1] <= lmax:
             raise InputError(f"the beam ends at l = {self.blm.shape[1] - 1}, below lmax {lmax}; compute it further.")
+
+    @property
+    def weighted(self) -> bool:
+        """Return True if the weights of the pixels differ."""
+        return bool(np.any(self.w[0, 1:] != 0.0))
+
+    @property
+    def circular(self) -> "ScannedBeam":
+        """Return the circular part of the beam, with the same weights."""
+        return ScannedBeam(self.blm[:1], self.w[:1])
 
     @property
     def smax(self) -> int:

@@ -30,10 +30,12 @@ def cmb_biposh_leading(
     lmax: int,
     x: ScannedBeam,
     y: ScannedBeam | None = None,
+    nthreads: int = 1,
 ) -> NDArray[np.complex128]:
     """Return the mean A^{LM}_{l1 l2} of modes (L, M, d), with |M|, |d| <= L, to leading order.
 
-    Raise InputError if a mode cannot exist, or spectrum or beam end below lmax.
+    Weights of pixels are taken as by :func:`cmb_biposh_exact`, with ``nthreads``. Raise InputError if a mode cannot
+    exist, or spectrum or beam end below lmax.
 
     Notes
     -----
@@ -43,6 +45,8 @@ def cmb_biposh_leading(
     (tests/unit/test_predict_brute_force.py); :func:`cmb_biposh_exact` includes it.
     """
     x, y = _checked(modes, cl, lmax, x, y)
+    if x.weighted or y.weighted:
+        return _summed(modes, cl, lmax, x, y, nthreads, leading=True)
     l2 = np.arange(lmax + 1)
     sign = (-1.0) ** l2
     root = np.sqrt(2.0 * l2 + 1)
@@ -73,7 +77,8 @@ def cmb_biposh_exact(
 
     L = 0 gives (-1)^l sqrt(2l+1) C_l with the second order of the beam. Include any power above ``lmax`` in ``cl``: it
     leaks down. The sums over L1, L2 end at the L_max of the moments of the beams; threads share the blocks of ell.
-    Raise InputError if a mode cannot exist, or spectrum or beam end below lmax.
+    Maps whose pixels have weights W_x, W_y are not divided by <W_x W_y>, and their own BipoSH is in the result. Raise
+    InputError if a mode cannot exist, or spectrum or beam end below lmax.
 
     Notes
     -----
@@ -89,11 +94,25 @@ def cmb_biposh_exact(
     A^{20}, it is within 8e-4, 2.5e-4 and 7e-5 of A^{20} with L_max 32, 64 and 128 (within a sixth of this at l = 400).
     """
     x, y = _checked(modes, cl, lmax, x, y)
+    return _summed(modes, cl, lmax, x, y, nthreads)
+
+
+def _summed(
+    modes: Sequence[Indices],
+    cl: NDArray[np.float64],
+    lmax: int,
+    x: ScannedBeam,
+    y: ScannedBeam,
+    nthreads: int,
+    leading: bool = False,
+) -> NDArray[np.complex128]:
+    """Return the sum over L1, L2 of :func:`cmb_biposh_exact`; ``leading``: without products of non-circular parts."""
     result = np.full((len(modes), lmax + 1), np.nan, dtype=np.complex128)
     groups: dict[tuple[int, int], list[int]] = {}
     for i, (L, _, d) in enumerate(modes):
         groups.setdefault((L, d), []).append(i)
-    plans = {(L, d): _plan(L, tuple(modes[i][1] for i in rows), x, y, len(cl) - 1) for (L, d), rows in groups.items()}
+    orders = {group: tuple(modes[i][1] for i in rows) for group, rows in groups.items()}
+    plans = {(L, d): _plan(L, orders[L, d], x, y, len(cl) - 1, leading) for L, d in groups}
     reach = max(abs(d) for _, d in groups) if groups else 0
     response_x, response_y = x.response(len(cl) - 1), y.response(len(cl) - 1)
     power = cl * (2.0 * np.arange(len(cl)) + 1) / (4 * np.pi)
@@ -170,13 +189,15 @@ class _Plan(NamedTuple):
     coupling: NDArray[np.complex128]
 
 
-def _plan(L: int, orders: tuple[int, ...], x: ScannedBeam, y: ScannedBeam, lsky: int) -> _Plan:
+def _plan(L: int, orders: tuple[int, ...], x: ScannedBeam, y: ScannedBeam, lsky: int, leading: bool) -> _Plan:
     size_x, size_y = (abs(beam.response(lsky)).max(axis=1) for beam in (x, y))
     limit = _TOLERANCE * 4 * np.pi
     pairs, counts, spins, couplings = [], [0], [], []
     for L1, L2, coupling in _moment_couplings(L, orders, x, y):
         scale = size_x[:, None] * size_y
         kept = np.argwhere((abs(coupling).max(axis=0) * scale > limit) & (abs(coupling).max(axis=0) > 0.0))
+        if leading:
+            kept = kept[(kept[:, 0] == x.smax) | (kept[:, 1] == y.smax)]
         if len(kept):
             pairs.append((L1, L2))
             spins.append(kept)

@@ -1,7 +1,7 @@
-"""Spin-harmonic coefficients w_{s,LM} of the orientation moments w_s = <e^{-i s psi}>.
+"""Spin-harmonic coefficients w_{s,LM} of the orientation moments w_s = <e^{-i s psi}>, and of weights of pixels.
 
-Every function returns a complex array of shape (smax + 1, L_max + 1, 2 L_max + 1) with w_{s,LM} at
-``[s, L, L_max + M]`` and zero where |M| > L or L < s: w_s = sum_LM w_{s,LM} (-s)Y_LM.
+Those of moments are complex arrays of shape (smax + 1, L_max + 1, 2 L_max + 1) with w_{s,LM} at ``[s, L, L_max + M]``
+and zero where |M| > L or L < s: w_s = sum_LM w_{s,LM} (-s)Y_LM. Weights W(n) take the place of w_0 = 1.
 """
 
 import ducc0
@@ -11,13 +11,16 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
-from mcsim.sphere.checks import check_angle, check_finite, check_whole, nside_of
+from mcsim.sphere.checks import check_angle, check_finite, check_shape, check_whole, nside_of
 
 
-def orientation_harmonics(w: NDArray[np.complex128], L_max: int, nthreads: int = 1) -> NDArray[np.complex128]:
+def orientation_harmonics(
+    w: NDArray[np.complex128], L_max: int, nthreads: int = 1, weight: NDArray[np.float64] | None = None
+) -> NDArray[np.complex128]:
     """Return w_{s,LM} of moment maps, w_s(n) = <e^{-i s psi}> for s = 1..smax, HEALPix RING, shape (smax, npix).
 
-    The moment w_0 is 1 everywhere. Raise InputError if a map is not finite or does not have 12 nside^2 pixels.
+    ``weight``, shape (npix,): of the pixels of a map that is analysed; the result is then that of W and of W w_s. By
+    default W = w_0 = 1 everywhere. Raise InputError if a map is not finite or does not have 12 nside^2 pixels.
 
     Notes
     -----
@@ -32,6 +35,9 @@ def orientation_harmonics(w: NDArray[np.complex128], L_max: int, nthreads: int =
     check_finite(w, "w")
     area = 4 * np.pi / npix
     result = _isotropic_zero(smax, L_max)
+    if weight is not None:
+        check_shape(weight, (npix,), "the weight")
+        w, result[0] = w * weight, map_harmonics(weight, L_max, nthreads)
     for s in range(1, min(smax, L_max) + 1):
         conjugate = np.stack([w[s - 1].real, -w[s - 1].imag]) * area
         gradient, curl = healpix.adjoint(conjugate, L_max, nthreads, spin=s)
@@ -41,6 +47,22 @@ def orientation_harmonics(w: NDArray[np.complex128], L_max: int, nthreads: int =
             span = slice(first + low, first + L_max + 1)
             result[s, low:, L_max - M] = -((-1) ** (s + M)) * (gradient[span] + 1j * curl[span]).conj()
             result[s, low:, L_max + M] = -((-1) ** s) * (gradient[span] - 1j * curl[span])
+    return result
+
+
+def map_harmonics(map_: NDArray[np.float64], L_max: int, nthreads: int = 1) -> NDArray[np.complex128]:
+    """Return the coefficients of a real HEALPix map in RING order, shape (L_max + 1, 2 L_max + 1), M at L_max + M.
+
+    Those beyond 3 nside - 1 are zero.
+    """
+    top = min(L_max, 3 * nside_of(map_.size, "the map") - 1)
+    alm = healpix.analysis(map_, top, iterations=3, nthreads=nthreads)
+    result = np.zeros((L_max + 1, 2 * L_max + 1), dtype=np.complex128)
+    for M in range(top + 1):
+        first = alm_.start(top, M)
+        column = alm[first + M : first + top + 1]
+        result[M : top + 1, L_max - M] = (-1) ** M * column.conj()
+        result[M : top + 1, L_max + M] = column
     return result
 
 
