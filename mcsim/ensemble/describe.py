@@ -71,7 +71,9 @@ def describe_prediction(prediction: xr.Dataset) -> str:
 
 def _spectra(prediction: xr.Dataset) -> list[str]:
     """Return lines for the bins of the strongest spectra, whole spectra if there is room."""
-    text = ["  binned means in uK^2 (of the beam: without what noise and masks make by themselves), errors of the mean of an isotropic ensemble:"]
+    text = [
+        "  binned means in uK^2 (of the beam: less what noise and masks make), errors of the mean of isotropic skies:"
+    ]
     text.append(f"    {'pair':<16} {'mode':<9} {'l':<11} {'mean':>22} {'error':>10} {'of the beam':>22}")
     rows = spectra(prediction, "").assign(beam=spectra(prediction, "_difference")["value"])
     best = strongest(prediction, "")

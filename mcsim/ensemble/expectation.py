@@ -9,7 +9,7 @@ import numpy as np
 from healpy import nside2pixarea
 from numpy.typing import NDArray
 
-from mcsim import config
+from mcsim import config, systematics
 from mcsim.bipolar.modes import Indices, existing
 from mcsim.bipolar.theory import (
     ScannedBeam,
@@ -33,6 +33,8 @@ L_WEIGHTS = range(64, 193, 32)
 """Highest degree of moments times weights: the first that holds :data:`SHARE` of the mean square of the weights."""
 
 SHARE = 0.99
+
+_LEFT_OUT = ("sky", "gain", "signal", "excess")  #: hooks of effects that no prediction follows
 
 
 @dataclass(frozen=True)
@@ -62,13 +64,27 @@ def scanned_beams(survey: Survey, L_max: int, nthreads: int = 1) -> tuple[Scanne
                 f"Channel {spec.name} reads two beams as a difference, which predictions do not cover; "
                 "predict the same model with hit_averaged instead."
             )
+    for channel in survey.channels:
+        _check_covered(channel)
     return tuple(
         ScannedBeam(
-            channel.beam.blm * channel.window, _orientations(spec.scan, channel, _weighted(survey, m), L_max, nthreads)
+            channel.beam.blm * channel.window ** (systematics.spread_of(channel.effects) ** 2),
+            _orientations(spec.scan, channel, _weighted(survey, m), L_max, nthreads),
         )
         for spec, channel in zip(survey.config.channels, survey.channels, strict=True)
         for m in channel.maps
     )
+
+
+def _check_covered(channel: Channel) -> None:
+    """Raise InputError for an effect that changes more than the beam, its orientations and the noise."""
+    for effect in channel.effects:
+        changed = [hook for hook in _LEFT_OUT if getattr(type(effect), hook) is not getattr(systematics.Effect, hook)]
+        if effect.amplitude != 0.0 and changed:
+            raise InputError(
+                f"effect {effect.name} on channel {channel.name} acts on the {changed[0]}, which predictions do not "
+                "cover; remove it, or simulate it with mcsim run."
+            )
 
 
 def _weighted(survey: Survey, m: SurveyMap) -> SurveyMap:
@@ -100,7 +116,9 @@ def _orientations(
             harmonics = spin_functions(rings.s, L_max, rings.theta)[rings.s]
             result[rings.s, :, L_max] = rings.phase * (harmonics @ rings.weight)
         return result
-    if isinstance(scan, config.ScanParallelTransport) and m.weight is None and m.preparation is None:
+    turned = any(type(one).orientations is not systematics.Effect.orientations for one in channel.effects)
+    plain = m.weight is None and m.preparation is None and not turned
+    if isinstance(scan, config.ScanParallelTransport) and plain:
         return parallel_transport_harmonics(smax, L_max, float(np.deg2rad(scan.psi0_deg)))
     return orientation_harmonics(np.asarray(m.moments.w[:smax]), L_max, nthreads, m.weight)
 

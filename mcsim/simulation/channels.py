@@ -163,7 +163,7 @@ def refuse_excess(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
                 f"effect {effect.name} on channel {channel} acts on orientation moments, but the scan takes "
                 'differences, which have none; remove it, or give a scan of kind "hit_averaged".'
             )
-    for effect in systematics.disturbing(acting):
+    for effect, _ in systematics.disturbing(acting):
         raise InputError(
             f"effect {effect.name} on channel {channel} adds noise to samples of one beam, but the scan takes "
             "differences; remove it, or use noise.sigma0_uk."

@@ -60,8 +60,8 @@ def maps(
             of_samples = isinstance(given, config.Noise) and given.hits is None
             if isinstance(given, config.Noise) and of_samples and given.sigma0_uk > 0.0:
                 stages.append(tod.white_noise(given.sigma0_uk, draw, _noise_factor(channel)))
-            for effect in systematics.disturbing(acting):
-                draw = rng.generator(run.ensemble.seed, realization, f"effect/{effect.name}/noise/{m.name}")
+            for effect, own in systematics.disturbing(acting):
+                draw = rng.generator(run.ensemble.seed, realization, f"{own}/noise/{m.name}")
                 stages.append(_disturbed(effect, draw))
             stream = tod.through(_seen(channel, grid, observe), stages)
             map_uk = tod.bin_samples(stream, site.nside)[0]

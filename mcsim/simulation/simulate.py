@@ -220,8 +220,8 @@ def _map_parts(
             extra.append(convolve.centroid_map(gradient, m.moments))
         if m.noise_uk is not None:
             extra.append(m.noise(seed, realization))
-        for effect in systematics.disturbing(channel.effects):
-            draw = rng.generator(seed, realization, f"effect/{effect.name}/noise/{m.name}")
+        for effect, own in systematics.disturbing(channel.effects):
+            draw = rng.generator(seed, realization, f"{own}/noise/{m.name}")
             extra.append(divided(effect.excess(m.moments.hits, draw), m.moments.hits))
         if m.gain is not None and whole is not None:
             extra.append(m.gain * whole)

@@ -213,7 +213,7 @@ def _adding(following: Callable[[int], Map]) -> tod.Stage:
 
 
 def _baseline_s(of: CorrelatedNoise) -> float:
-    return of.noise.baseline_s or of.model.spin_period_s
+    return of.noise.baseline_s or abs(of.model.spin_period_s)
 
 
 def _number(of: CorrelatedNoise, line: LineOfSight) -> int:

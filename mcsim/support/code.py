@@ -69,6 +69,7 @@ def _of_script(kind: type | FunctionType, met: list[Any]) -> list[str]:
 def _held(kind: type | FunctionType, met: list[Any]) -> list[str]:
     """Return the values that the functions of a class, or a function, hold from around them."""
     own = [getattr(one, "__func__", getattr(one, "fget", getattr(one, "func", one))) for one in vars(kind).values()]
+    own = [inspect.unwrap(one) if callable(one) else one for one in own]
     functions = [one for one in ([kind] if isinstance(kind, FunctionType) else own) if isinstance(one, FunctionType)]
     found = []
     for function in functions:

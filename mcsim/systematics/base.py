@@ -6,7 +6,7 @@ maps and orientation moments) and the sample-by-sample one, so that an effect th
 a diagnosis, or acts in the time-ordered reference is one and the same.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal, Self
 
@@ -19,6 +19,7 @@ from mcsim.instrument.scan import LineOfSight, Moments, ScanModel
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import rng
 from mcsim.support.numbers import measured
+from mcsim.systematics.hooks import guard
 from mcsim.systematics.parametrization import Parametrization, Vector
 
 Alm = NDArray[np.complex128]
@@ -184,7 +185,7 @@ class Effect:
     amplitude: float = 0.0
 
     def __init_subclass__(cls) -> None:
-        """Refuse a class that says itself how it is fitted: nobody would read it there."""
+        """Refuse a class that says itself how it is fitted, which nobody would read there; guard a user's hooks."""
         super().__init_subclass__()
         misplaced = [key for key in vars(cls) if key in dir(Parametrization) and not key.startswith("_")]
         if misplaced:
@@ -192,6 +193,8 @@ class Effect:
                 f"effect {cls.__name__} says {', '.join(misplaced)} itself; let its parametrization say it, as in "
                 "parametrization = Parametrization(stochastic=True)."
             )
+        if not cls.__module__.startswith("mcsim."):
+            guard(cls)
 
     # Stages, in the order in which they act.
 
@@ -355,9 +358,11 @@ def adding(acting: Iterable[Effect]) -> list[Effect]:
     return [one for one in acting if one.amplitude != 0.0 and type(one).signal is not Effect.signal]
 
 
-def disturbing(acting: Iterable[Effect]) -> list[Effect]:
-    """Return the effects that add noise of their own to samples."""
-    return [one for one in acting if one.amplitude != 0.0 and type(one).excess is not Effect.excess]
+def disturbing(acting: Iterable[Effect]) -> list[tuple[Effect, str]]:
+    """Return the effects that add noise of their own to samples, with the names of their :func:`streams`."""
+    return [
+        (one, own) for one, own in streams(acting) if one.amplitude != 0.0 and type(one).excess is not Effect.excess
+    ]
 
 
 def tried(acting: Sequence[Effect], site: Site) -> Beam:
@@ -375,15 +380,23 @@ def tried(acting: Sequence[Effect], site: Site) -> Beam:
 
 def looked_at(acting: Iterable[Effect], sky: Alm, site: Site, seed: int, realization: int) -> Alm:
     """Return the sky that a channel looks at, uK; what an effect draws depends on its own name, not on the channel."""
-    for effect in acting:
+    for effect, own in streams(acting):
         if effect.amplitude == 0.0:
             continue
 
-        def draw(stage: str, name: str = effect.name) -> np.random.Generator:
-            return rng.generator(seed, realization, f"effect/{name}/{stage}")
+        def draw(stage: str, own: str = own) -> np.random.Generator:
+            return rng.generator(seed, realization, f"{own}/{stage}")
 
         sky = effect.sky(sky, site, draw)
     return sky
+
+
+def streams(acting: Iterable[Effect]) -> Iterator[tuple[Effect, str]]:
+    """Yield effects with the names of their random streams: the second one of a name draws anew."""
+    met: dict[str, int] = {}
+    for effect in acting:
+        number = met[effect.name] = met.get(effect.name, 0) + 1
+        yield effect, f"effect/{effect.name}" if number == 1 else f"effect/{effect.name}/{number}"
 
 
 def scan_direction(angle_deg: float, period_deg: float = 360.0) -> str:

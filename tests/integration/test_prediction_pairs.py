@@ -12,10 +12,12 @@ from scipy import stats
 
 from mcsim import beamfit, config
 from mcsim.beamfit.data import SUMMARY, Row, project
+from mcsim.bipolar.modes import Mode
 from mcsim.ensemble import describe, prediction, tables
 from mcsim.instrument import scan
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import Survey, survey
+from refusals import refused
 
 NSIDE, LMAX, SKIES, BIN = 32, 64, 200, 16
 THETA, PHI = healpy.pix2ang(NSIDE, np.arange(12 * NSIDE**2))
@@ -187,6 +189,41 @@ def test_masks_of_two_maps_are_predicted(holes: bool, tmp_path: Path, monkeypatc
     leading = prediction.predict(shared)
     left = np.nanmax(np.abs(leading["biposh_difference_mean"].values - difference))
     assert left < 0.15 * np.nanmax(np.abs(difference))
+
+
+@pytest.mark.parametrize(
+    ("effect", "scan_"),
+    [
+        ({"name": "pixelization", "amplitude": -1.0}, {"kind": "hit_averaged", "model": "wmap"}),
+        ({"name": "orientation_averaging", "amplitude": 0.7, "model": "wmap"}, {"kind": "parallel_transport"}),
+    ],
+)
+def test_effects_are_predicted_or_refused(
+    effect: dict[str, Any], scan_: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    beam = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 500.0, "fwhm_minor_arcmin": 400.0}
+    if scan_["kind"] == "hit_averaged":
+        scan_ = scan_ | {"sample_period_s": 61.0}
+    run = {
+        "name": "acting",
+        "sky": {"spectrum": "wmap7", "lmax": 16},
+        "map": {"nside": 16, "offset_order": 0},
+        "channel": [{"name": "W1", "beam": beam, "scan": scan_}],
+        "biposh": {"L_max": 2, "iterations": 3},
+        "effect": [effect | {"channel": "W1"}],
+    }
+    shared = survey(config.load(run))
+    found = exact_mean(shared, monkeypatch)
+    expected = prediction.predict(shared, exact=True)
+    mode = shared.estimator.modes.index(Mode(2, 0, 0))
+    difference = (found["biposh"] - found["biposh_circular"])[0, mode, 4:]
+    assert expected["biposh_difference_mean"].values[0, mode, 4:] == pytest.approx(difference, rel=0.02)
+    assert expected["cl_mean"].values[0, 4:] == pytest.approx(found["cl"][0, 4:], rel=0.01)
+    drift = {"name": "gain_drift", "channel": "W1", "amplitude": 0.1}
+    scanned = {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 61.0}
+    changed = run | {"effect": [drift], "channel": [{"name": "W1", "beam": beam, "scan": scanned}]}
+    with refused("gain_drift", "W1", "gain"):
+        prediction.predict(changed)
 
 
 def test_what_is_fitted_behind_a_mask_is_the_beam(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 from mcsim import systematics
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel
+from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.sphere.spectra import load
 from mcsim.systematics import Parametrization, registry
@@ -190,6 +191,9 @@ class Foreign(systematics.Effect):
     cause = signature = "a test"
     step = 1.0
 
+    def spread(self):
+        return 1.0 - self.amplitude
+
 
 @pytest.fixture
 def registered(monkeypatch):
@@ -221,6 +225,7 @@ def test_broken_packages_are_named(registered):
 def whole(**changes):
     """An effect of another package, with attributes that differ from a whole one's; None: left out."""
     own = {"name": "foreign", "scope": "channel", "unit": "-", "cause": "a test", "signature": "none", "step": 1.0}
+    own["spread"] = lambda self: 1.0 - self.amplitude
     body = {key: value for key, value in (own | changes).items() if value is not None}
     return dataclass(frozen=True, kw_only=True)(type("Thing", (systematics.Effect,), body))
 
@@ -262,6 +267,7 @@ def test_an_effect_that_says_itself_how_it_is_fitted_is_refused(key):
         (whole(variants=({"no_such": 1.0},)), "no_such"),
         (whole(parametrization=Angle(parameter="no_such")), "no_such"),
         (whole(parametrization=Doubled()), "coordinates"),
+        (whole(spread=None), "orientations"),
         (no_dataclass(), "angle_deg"),
         (no_default(), "angle_deg"),
     ],
@@ -274,3 +280,27 @@ def test_an_effect_that_is_not_whole_is_refused_when_it_is_loaded(kind, key, reg
     registered(Entry("foreign", "package:Thing", registry.ENTRY_POINTS))
     with refused(key):
         systematics.catalogue()
+
+
+@pytest.mark.parametrize(
+    ("gain", "named"),
+    [
+        (lambda self, time_s, site: np.full(time_s.shape, np.nan), ("foreign", "gain", "finite")),
+        (lambda self, time_s, site: np.zeros(3), ("gain", "(3,)", "(5,)")),
+        (lambda self, time_s, site: time_s.no_such, ("gain", "AttributeError", "no_such")),
+    ],
+)
+def test_a_hook_that_fails_says_which(gain, named, site):
+    with refused(*named):
+        whole(gain=gain)(amplitude=1.0).gain(np.zeros(5), site)
+
+
+def test_effects_of_one_name_draw_apart(site):
+    once = systematics.build("point_sources", {"amplitude": 1.0})
+    sky = np.zeros(alm_.size(LMAX), dtype=complex)
+    alone = systematics.looked_at([once], sky, site, 1, 0)
+    both = systematics.looked_at([once, once], sky, site, 1, 0)
+    power = [np.mean(np.abs(one[LMAX + 1 :]) ** 2) for one in (alone, both - alone)]
+    assert np.array_equal(systematics.looked_at([once], sky, site, 1, 0), alone)
+    correlation = np.mean((alone * (both - alone).conj())[LMAX + 1 :]).real / np.sqrt(power[0] * power[1])
+    assert abs(correlation) < 4.0 / np.sqrt(2.0 * alone[LMAX + 1 :].size)

@@ -186,6 +186,13 @@ def test_samples_have_the_noise_of_the_default_route():
     assert noisy - quiet == pytest.approx(survey(run).channels[0].maps[0].noise(3, 0), abs=1e-9)
 
 
+def test_a_survey_that_spins_backwards_has_noise():
+    run = run_with(DESTRIPED | {"baseline_s": None})
+    model = replace(model_of(run), spin_period_s=-model_of(run).spin_period_s)
+    made = timestream.correlated_noise(run.channels[0].noise, model, MapGrid(NSIDE), "noise/W")
+    assert np.isfinite(made.draw(1, 0)[made.hits > 0]).all()
+
+
 def test_chunks_change_no_bit(monkeypatch):
     whole = short(DESTRIPED)[0].draw(1, 2)
     made = short(DESTRIPED)[0]

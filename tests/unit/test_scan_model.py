@@ -90,6 +90,8 @@ def test_last_sample_survives_rounding():
         ('name = "right"', 'name = "left"', ("'left'",)),
         ('name = "right"', "", ("[[line_of_sight]]", "name")),
         ('both = ["left", "right"]', 'both = ["left"]', ("pairs.both", 1, 2)),
+        ('both = ["left", "right"]', 'both = ["left", "left"]', ("both", "left, left")),
+        ("schema = 1", 'schema = 1\ndefault_lines = ["right", "right"]', ("default_lines", "right, right")),
         ('both = ["left", "right"]', 'both = ["left", "middle"]', ("pairs.both", "middle", "left, right")),
         ('both = ["left", "right"]', 'both = "left"', ("pairs.both", "'left'")),
         ('spin_period_s = "made up"', 'spin = "made up"', ("[source]", "'spin'", "duration_days")),

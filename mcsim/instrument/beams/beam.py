@@ -305,6 +305,8 @@ class Beam:
 
     def save(self, path: str | Path) -> None:
         """Write the beam as a .npz file, from which :meth:`from_blm` reads the same beam, bit for bit."""
+        if Path(path).suffix != ".npz":
+            raise InputError(f"{path} does not end in .npz, by which the beam is read again; give such a name.")
         with unwritable(path, "choose another file"):
             np.savez(user_path(path), blm=self.blm, neglected_power=self.neglected_power, integral=self.integral)
 

@@ -347,6 +347,9 @@ def _check(model: ScanModel) -> None:
         raise InputError(
             f"{where}: precession_angle_deg is {model.precession_angle_deg:g}, but it must be between 0 and 90."
         )
+    for label, lines in (("default_lines", model.default_lines), *model.pairs.items()):
+        if len(set(lines)) < len(lines):
+            raise InputError(f"{where}: {label} names a line of sight twice, {', '.join(lines)}; name each once.")
     for line in model.lines_of_sight:
         inside = f"{where}, line of sight {line.name!r}"
         if not 0.0 < line.boresight_angle_deg < 180.0:
