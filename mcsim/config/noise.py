@@ -161,6 +161,12 @@ def check_splits(channel: Any, splits: tuple[str, ...], split_by: str) -> None:
         raise ValueError(
             f'map.split_by = "rings" needs rings of one beam, but {key}.scan is of kind "differencing"; split by "time"'
         )
+    path = str(getattr(channel.scan, "path", "{split}"))
+    if splits and split_by == "time" and "{split}" not in path:
+        raise ValueError(
+            f"{key}.scan.path is one file of the whole survey, but map.splits are parts of its time; give each a file, "
+            'with {split} in the path, or set map.split_by = "rings" (a share of every pixel\'s hits)'
+        )
     for name, noise in (("noise", channel.noise), *((f"split_noise.{k}", n) for k, n in channel.split_noise.items())):
         if isinstance(noise, NoiseCorrelated) and channel.scan.kind != "hit_averaged":
             raise ValueError(

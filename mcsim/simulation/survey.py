@@ -223,6 +223,7 @@ def _channel(
         if isinstance(spec.scan, config.ScanDifferencing):
             model = scan_model(spec, spec.scan, split)
             refuse_excess(spec.name, acting)
+            scan.warn_of_aliases(model, grid)
             pairs = mapmaking.prepare(model, spec.scan.pair, grid, nthreads=nthreads, progress=progress)
             smax = max(beam.mmax, orders, 1)
             moments = pairs.moments(smax, nthreads, progress) if orders else pairs.hits_alone(smax)
@@ -235,8 +236,8 @@ def _channel(
                 moments = _moments_of_file(path, grid.nside, wanted, grid.frame)
             else:
                 moments = _moments(spec, split, grid, max(smax, 1), nthreads, progress)
-                if run.map.split_by == "rings" and isinstance(spec.scan, config.ScanHitAveraged):
-                    moments = replace(moments, hits=moments.hits / len(splits))
+            if run.map.split_by == "rings" and _whole_survey(spec.scan):
+                moments = replace(moments, hits=moments.hits / len(splits))
             moments = with_offsets(moments, offsets, spec)
             # An effect may give the beam higher orders than a file of moments has: they are left out.
             beam = beam.truncated(moments.smax) if acting and moments.smax < beam.mmax else beam
@@ -252,6 +253,13 @@ def _channel(
     response = convolve.response(beam, run.sky.lmax, seen_window)
     side_b = _side_b(spec, seen_window, site, acting)
     return Channel(spec.name, beam, response, window, tuple(maps), site, acting, side_b)
+
+
+def _whole_survey(scan: config.Scan) -> bool:
+    """Return True if a scan describes all rings, whatever the split."""
+    if isinstance(scan, config.ScanPointing | config.ScanMoments):
+        return "{split}" not in str(scan.path)
+    return isinstance(scan, config.ScanHitAveraged)
 
 
 def _prepared(run: config.RunConfig, spec: config.Channel, channel: Channel) -> Channel:
@@ -344,6 +352,7 @@ def _moments(
             return scan.Moments.from_pointing_files([path], grid.nside, smax, grid.frame, grid.offset_order)
         case config.ScanHitAveraged():
             model = scan_model(spec, spec.scan, split)
+            scan.warn_of_aliases(model, grid)
             return _mapped(scan.cached_moments(model, grid, smax, nthreads, progress))
         case config.ScanMoments() | config.ScanDifferencing():
             raise TypeError("the caller reads files of moments, and a differencing scan has no moments")

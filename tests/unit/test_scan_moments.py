@@ -14,6 +14,7 @@ from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.moments import Moments, cached_moments, scan_key
 from mcsim.instrument.scan.pointing import pointing
+from mcsim.instrument.scan.sampling import warn_of_aliases
 from mcsim.support.folders import default_cache_dir
 from refusals import refused
 
@@ -448,3 +449,19 @@ def test_unreadable_user_pointing(tmp_path):
     np.save(tmp_path / "p.npy", np.zeros((3, 2)))
     with refused("p.npy", "(3, 2)"):
         Moments.from_pointing_files(tmp_path / "p.npy", NSIDE, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "period_s", "phases"),
+    [("wmap", 129.3, 1), ("wmap", 3620.4, 1), ("planck", 10.0, 6), ("litebird", 600.0, 2)],
+)
+def test_samples_that_miss_phases_of_the_spin_are_told(name: str, period_s: float, phases: int) -> None:
+    model = ScanModel.load(name).with_sampling(period_s)
+    with pytest.warns(UserWarning, match=rf"{period_s:g} s fall on {phases} phase"):
+        Moments.on_grid(replace(model, duration_days=20.0), MapGrid(8), smax=1)
+
+
+@pytest.mark.parametrize(("name", "period_s"), [("wmap", 61.0), ("planck", 7.0), ("litebird", 61.0), ("wmap", 2.0)])
+def test_usual_samples_are_not(name: str, period_s: float) -> None:
+    for nside in (8, 64, 512):
+        warn_of_aliases(ScanModel.load(name).with_sampling(period_s), MapGrid(nside))

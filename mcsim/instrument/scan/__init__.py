@@ -6,6 +6,7 @@ from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.limit import limit_moments
 from mcsim.instrument.scan.model import LineOfSight, ScanModel, read_described
 from mcsim.instrument.scan.moments import Moments, cached_moments, scan_key
+from mcsim.instrument.scan.sampling import warn_of_aliases
 
 __all__ = [
     "LineOfSight",
@@ -20,5 +21,6 @@ __all__ = [
     "scan_factors",
     "scan_key",
     "summary",
+    "warn_of_aliases",
     "write_moments_fits",
 ]

@@ -11,6 +11,7 @@ from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.model import ScanModel
 from mcsim.instrument.scan.offsets import add_powers, centres, exponents
 from mcsim.instrument.scan.pointing import BLOCK, PointingStream, fill_block, fill_pixels
+from mcsim.instrument.scan.sampling import warn_of_aliases
 from mcsim.sphere.checks import check_memory, check_whole
 from mcsim.support.compiled import njit
 from mcsim.support.threads import interruptible
@@ -42,6 +43,7 @@ def stream_sums(
     """
     check_whole(smax, "smax", 1)
     check_whole(nthreads, "nthreads", 1)
+    warn_of_aliases(model, grid)
     tasks = []
     for line in model.select():
         first, last = grid.sample_range(model, line)

@@ -76,7 +76,7 @@ class ScanModel:
     Examples
     --------
     >>> from mcsim import ScanModel
-    >>> model = ScanModel.load("planck").with_sampling(10.0)
+    >>> model = ScanModel.load("planck").with_sampling(7.0)
     >>> model.samples(model.lines_of_sight[0]) > 1_000_000
     True
     """
