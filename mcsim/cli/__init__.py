@@ -231,7 +231,7 @@ def limit(
     output: Annotated[
         Path | None, Option("-o", "--output", metavar="DIR", help="Folder for limit.json, limit.zarr and limit.png.")
     ] = None,
-    only: Annotated[list[str] | None, Option(metavar="EFFECT", help="Compute only this one; repeatable.")] = None,
+    only: Annotated[list[str] | None, Option(metavar="EFFECT", help="Only this name or FILE.py; repeatable.")] = None,
     without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Leave it out; repeatable.")] = None,
     nuisance: Annotated[
         list[str] | None, Option(metavar="EFFECT[:CHANNEL]=WIDTH", help="Unknown within this prior; repeatable.")

@@ -233,8 +233,10 @@ def _candidates(
     if not 0.0 <= settings.unknown_dipole_uk < np.inf:
         raise InputError(f"unknown_dipole_uk = {settings.unknown_dipole_uk:g} is no rms; give 0 or more.")
     library = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
-    for name in (*settings.only, *settings.without):
-        systematics.get(name, library)
+    asked = {name: systematics.get(name, library) for name in (*settings.only, *settings.without)}
+    library = {**library, **{kind.name: kind for kind in asked.values()}}
+    only, without = ([asked[name].name for name in names] for names in (settings.only, settings.without))
+    settings = replace(settings, only=tuple(only), without=tuple(without))
     named = dict.fromkeys((*settings.only, *(name.partition(":")[0] for name in settings.nuisances)))
     for name in named:
         if name in library and library[name].excess is not systematics.Effect.excess:
@@ -259,8 +261,9 @@ def _candidates(
     ]
     if all(_is_nuisance(candidate, settings) for candidate in wanted):
         raise InputError(
-            f"no effect is left to compute a limit of (asked for: {', '.join(settings.only) or 'all'}); ask for one "
-            f"that is no nuisance, of {', '.join(sorted({candidate.name for candidate in analysis.candidates}))}."
+            f"no effect is left to compute a limit of (asked for: {', '.join(settings.only) or 'all'}): it is a "
+            "nuisance, or this model lacks what it acts on, such as the times of a scan; ask for one of "
+            f"{', '.join(sorted({candidate.name for candidate in analysis.candidates}))}."
         )
     return analysis, numbered([replace(candidate) for candidate in wanted])
 

@@ -56,13 +56,14 @@ def ensemble_figure(
 
 def _matching(prediction: xr.Dataset, pair: str, modes: xr.Dataset) -> xr.Dataset:
     """Return the same pair and modes of a prediction."""
-    try:
-        return prediction.sel(pair=pair, mode=modes["mode"].values)
-    except KeyError as error:
-        raise InputError(
-            f"The prediction lacks the pair {pair} or one of its modes ({error.args[0]}); predict from the "
-            "configuration of the ensemble."
-        ) from None
+    for dim, wanted in (("pair", [pair]), ("mode", modes["mode"].values.tolist())):
+        there = prediction[dim].values.tolist()
+        if lacking := [name for name in wanted if name not in there]:
+            raise InputError(
+                f"the prediction has no {dim} {lacking[0]} but {', '.join(map(str, there[:6]))}; predict from the "
+                "configuration of the ensemble."
+            )
+    return prediction.sel(pair=pair, mode=modes["mode"].values)
 
 
 def _draw(modes: xr.Dataset, title: str, expected: xr.Dataset | None) -> Figure:

@@ -110,7 +110,7 @@ def test_psi_of_the_other_sign_and_from_the_other_end_is_named():
     beam = mcsim.Beam.elliptical(400.0, 320.0, lmax=32, mmax=3)
     beam.blm[1] += 0.05 * beam.blm[0] * (np.arange(33) / 32) ** 3
     beam.blm[3, 3:] += 0.03 * beam.blm[0, 3:] * (np.arange(3, 33) / 32) ** 3
-    simulator = Simulator(small("litebird", beam))
+    simulator = Simulator(small("litebird", beam, period_s=631.0))
     found = mcsim.compare(simulator(), simulator(psi=lambda p: np.pi - p), simulator.run)
     (channel,) = found.channels
     said = [{d.name for d in one} for one in (channel.differences, *channel.alternatives)]
@@ -153,7 +153,7 @@ def test_the_nearest_set_is_said_as_a_whole():
     """A sign alone leaves more than there was; beside half a turn it leaves next to nothing."""
     beam = mcsim.Beam.elliptical(400.0, 320.0, lmax=32, mmax=3)
     beam.blm[1] += 0.05 * beam.blm[0] * (np.arange(33) / 32) ** 3
-    simulator = Simulator(small("litebird", beam))
+    simulator = Simulator(small("litebird", beam, period_s=631.0))
     draw = np.random.default_rng(1)
     side_b = [m + 0.5 * draw.standard_normal(m.size) for m in simulator(psi=lambda p: np.pi - p)]
     [found] = mcsim.compare(simulator(), side_b, simulator.run).channels

@@ -179,7 +179,7 @@ def test_what_cannot_be_compared_is_refused(a, b, model):
 
 def test_a_run_is_simulated_sample_by_sample_where_the_other_side_is(tmp_path):
     """Samples spread over their pixels: the moments of the default simulation miss a few per cent of the sky."""
-    simulator = Simulator(small("litebird", mcsim.Beam.gaussian(380.0, 32)))
+    simulator = Simulator(small("litebird", mcsim.Beam.gaussian(380.0, 32), period_s=631.0))
     for split, map_ in zip(("half1", "half2"), simulator(), strict=True):
         write_map(tmp_path / f"W1_{split}.fits", map_.astype(np.float32), "ecliptic")
     model = tmp_path / "run.toml"
@@ -187,7 +187,7 @@ def test_a_run_is_simulated_sample_by_sample_where_the_other_side_is(tmp_path):
         'schema = 1\nname = "pair"\nsky = { spectrum = "wmap7", lmax = 32 }\nensemble = { seed = 3 }\n'
         'map = { nside = 16, splits = ["half1", "half2"] }\n'
         '[[channel]]\nname = "W1"\nbeam = { kind = "gaussian", fwhm_arcmin = 380.0 }\n'
-        'scan = { kind = "hit_averaged", model = "litebird", sample_period_s = 601.0 }\n'
+        'scan = { kind = "hit_averaged", model = "litebird", sample_period_s = 631.0 }\n'
     )
     found = mcsim.compare(model, tmp_path)
     assert found.verdict == "identical"

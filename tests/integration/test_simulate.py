@@ -61,7 +61,11 @@ def test_noise_has_the_level_of_the_hits_and_none_in_the_cross_spectra(tmp_path:
     scan.write_moments_fits(tmp_path / "m.fits", moments)
     noisy = channel(noise={"sigma0_uk": sigma0}, scan={"kind": "moments", "path": str(tmp_path / "m.fits")})
     shared = survey(
-        config.load(table(map={"nside": nside, "splits": ["a", "b"], "pixel_window": "none"}, channel=[noisy]))
+        config.load(
+            table(
+                map={"nside": nside, "splits": ["a", "b"], "split_by": "sets", "pixel_window": "none"}, channel=[noisy]
+            )
+        )
     )
     assert shared.pair_names == ("W1:a,W1:a", "W1:a,W1:b", "W1:b,W1:b")
     cl = np.mean([simulate.realize(shared, r)["cl"] for r in range(n)], axis=0)[:, 2:]

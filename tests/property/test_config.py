@@ -57,12 +57,15 @@ def runs(draw):
     """A valid run as TOML would give it."""
     nside = 2 ** draw(st.integers(1, 9))
     lmax = draw(st.integers(2, 3 * nside - 1))
+    splits = draw(st.lists(LABELS, unique=True, max_size=3))
+    # One file of moments does not tell spans of time apart.
+    kinds = st.fixed_dictionaries({"splits": st.just(splits), "split_by": st.sampled_from(["rings", "sets"])})
     return {
         "schema": 1,
         "name": draw(LABELS),
         "sky": {"spectrum": "wmap7", "lmax": draw(st.integers(lmax, 4000))},
         "map": {"nside": nside, "frame": draw(st.sampled_from(["ecliptic", "galactic", "equatorial"]))}
-        | draw(st.fixed_dictionaries({}, optional={"splits": st.lists(LABELS, unique=True, max_size=3)})),
+        | (draw(kinds) if splits else {}),
         "channel": draw(CHANNELS),
         "biposh": {"lmax": lmax, "L_max": draw(st.integers(0, 2))},
         "ensemble": {"realizations": draw(st.integers(1, 10**6)), "seed": draw(st.integers(0, 2**63 - 1))},

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import healpy
@@ -130,6 +131,17 @@ def test_signals_of_samples_change_the_mean(name: str) -> None:
 def test_noise_that_hits_samples_at_random_has_no_limit() -> None:
     with refused("excess_noise", "noise_level"):
         mcsim.limit(model(), settings=mcsim.LimitSettings(only=("excess_noise",)))
+
+
+def test_an_effect_of_a_file_has_a_limit_and_one_that_cannot_act_has_none() -> None:
+    file = str(Path(__file__).parents[2] / "docs" / "howto" / "gain_step.py")
+    found = mcsim.limit(model(), settings=mcsim.LimitSettings(only=(file,), dense=True))
+    assert {one.name for one in found.effects} == {"gain_step"}
+    still = replace(model(), channels=tuple(replace(c, scan=config.ScanParallelTransport()) for c in model().channels))
+    with refused("gain_drift", "beam_width"):
+        mcsim.limit(
+            replace(still, map=replace(still.map, splits=())), settings=mcsim.LimitSettings(only=("gain_drift",))
+        )
 
 
 @pytest.mark.slow
