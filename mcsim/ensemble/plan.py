@@ -14,8 +14,9 @@ from mcsim.bipolar.modes import CONVENTION, NORMALISATION
 from mcsim.ensemble import store
 from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
+from mcsim.instrument.scan import read_moments
 from mcsim.instrument.scan.accumulate import SECONDS_PER_SAMPLE
-from mcsim.simulation import differencing, noise, offsets
+from mcsim.simulation import differencing, noise, offsets, skies
 from mcsim.simulation.channels import check_effects, check_scans, load_beam, refuse_external, scan_model
 from mcsim.simulation.filtering import Bands, probes_of
 from mcsim.simulation.preparation import preparation
@@ -23,6 +24,7 @@ from mcsim.simulation.survey import Survey
 from mcsim.simulation.timestream import LEVEL_DRAWS
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng, spectra
+from mcsim.sphere.mask import read_mask
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.support.code import version
 from mcsim.support.numbers import duration
@@ -174,6 +176,7 @@ def describe(source: str | Path, part: slice | None = None, workers: int | None 
     refuse_external(run)
     check_scans(run)
     check_effects(run)
+    _check_files(run)
     number, found = len(wanted(run, part)), with_scans(cost(run), run)
     memory, *rest = found.lines(number, workers or run.compute.workers)
     disk = float(found.layout.realization_bytes()) * number
@@ -185,6 +188,21 @@ def describe(source: str | Path, part: slice | None = None, workers: int | None 
             *rest,
         ]
     )
+
+
+def _check_files(run: config.RunConfig) -> None:
+    """Raise InputError, as the run itself would, for masks, moments or a first sky that cannot be used."""
+    skies.given(run, 0)
+    nside, frame = config.prepared_grid(run)
+    for m in run.each_map:
+        channel, mask = m.channel, m.channel.mask or run.map.mask
+        if mask is not None:
+            weight = read_mask(config.channel_path(mask, channel.name, m.split), nside, frame, run.map.mask_frame)
+            if not weight.any():
+                raise InputError(f"the mask of map {m.name} leaves no pixel; widen it.")
+        if isinstance(channel.scan, config.ScanMoments):
+            path = config.channel_path(channel.scan.path, channel.name, m.split)
+            read_moments(path, run.map.resolution, load_beam(channel, run.sky.lmax).mmax, run.map.frame)
 
 
 def cost(run: config.RunConfig) -> Cost:

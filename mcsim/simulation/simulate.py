@@ -8,7 +8,7 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import bipolar, config, systematics
+from mcsim import bipolar, systematics
 from mcsim.simulation import convolve, differencing, rings, skies
 from mcsim.simulation.offsets import Expansion, expansion, offset_maps
 from mcsim.simulation.survey import Channel, Survey, SurveyMap
@@ -48,15 +48,8 @@ def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, ND
 
 def draw_sky(survey: Survey, realization: int) -> Alm:
     """Draw the sky of one realization, or read it from the user's files: a_lm up to the sky's lmax, uK."""
-    sky = survey.config.sky
-    if sky.alm is not None:
-        return skies.read_alm(config.sky_path(sky.alm, realization), sky.lmax, survey.config.map.frame)
-    if sky.map is not None:
-        channels = {channel.frequency_ghz for channel in survey.config.channels}
-        frequency = channels.pop() if len(channels) == 1 else None
-        return skies.read_map(
-            config.sky_path(sky.map, realization), sky.lmax, survey.config.map.frame, frequency_ghz=frequency
-        )
+    if (known := skies.given(survey.config, realization)) is not None:
+        return known
     assert survey.cl is not None  # the configuration holds at least one of the three sources
     return gaussian_alm(survey.cl, rng.generator(survey.config.ensemble.seed, realization, "sky"))
 

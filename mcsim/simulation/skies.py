@@ -7,6 +7,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from mcsim import config
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
@@ -18,6 +19,18 @@ LARGEST_UK = 1e7  #: of a user's sky: 10 K, more than the Galaxy has in any band
 
 SMALLEST_UK = 0.01
 """Of the largest value of a user's sky that is not zero: a CMB sky in K has 5e-4, and any in uK has more than 1."""
+
+
+def given(run: config.RunConfig, realization: int) -> Alm | None:
+    """Return the sky of a realization that a run reads from files, a_lm up to the sky's lmax, uK; None: it draws it."""
+    sky, frame = run.sky, run.map.frame
+    if sky.alm is not None:
+        return read_alm(config.sky_path(sky.alm, realization), sky.lmax, frame)
+    if sky.map is None:
+        return None
+    channels = {channel.frequency_ghz for channel in run.channels}
+    frequency = channels.pop() if len(channels) == 1 else None
+    return read_map(config.sky_path(sky.map, realization), sky.lmax, frame, frequency_ghz=frequency)
 
 
 def read_alm(path: Path, lmax: int, frame: str) -> Alm:

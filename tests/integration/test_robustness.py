@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import healpy
 import numpy as np
@@ -13,10 +14,11 @@ import pytest
 import zarr
 from distributed import Client
 
-from mcsim import config, open_ensemble, open_summary
-from mcsim.ensemble import runner, store
+from mcsim import Moments, config, open_ensemble, open_summary
+from mcsim.ensemble import plan, runner, store
 from mcsim.ensemble.lock import locked
 from mcsim.errors import RunError
+from mcsim.instrument.scan import write_moments_fits
 from refusals import refused
 
 from .conftest import ensemble, table
@@ -161,3 +163,20 @@ def test_units_and_frames_of_skies(client: Client, tmp_path: Path) -> None:
             runner.run(
                 table(sky={"lmax": 32, "map": str(tmp_path / "sky.fits")}), tmp_path / "bad.zarr", workers=client
             )
+
+
+@pytest.mark.parametrize(("number", "value"), [(8, None), (16, 2.0), (16, 0.0)])
+def test_a_dry_run_reads_masks_and_moments(number: int, value: float | None, tmp_path: Path) -> None:
+    """A mask of numbers above one or of nothing is refused, as the run would, and moments of another nside."""
+    changes: dict[str, Any] = {"map": {"nside": 16}}
+    if value is None:
+        moments = Moments.parallel_transport(number)
+        write_moments_fits(tmp_path / "m.fits", moments)
+        scan = {"kind": "moments", "path": str(tmp_path / "m.fits")}
+        changes["channel"] = [table()["channel"][0] | {"scan": scan}]
+    else:
+        healpy.write_map(tmp_path / "mask.fits", np.full(12 * number**2, value), dtype=np.float64)
+        changes["map"] |= {"mask": str(tmp_path / "mask.fits")}
+    run = config.load(table(**changes))
+    with refused("W1" if value == 0.0 else str(tmp_path)):
+        plan.describe(run)
