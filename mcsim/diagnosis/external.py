@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import ks_2samp
 
 from mcsim import config
-from mcsim.diagnosis.assemble import effects_of
+from mcsim.datavector.candidate import parts_of
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.result import Agreement
 from mcsim.ensemble.external import named_source, source_of
@@ -101,8 +101,10 @@ def agreement(known: DiagnosisContext) -> Agreement:
         there = 2.0 * null.mean - mean
         fit = null.fit(there, known.templates[:, list(known.candidates[best].columns)])
         try:
-            (effect,) = effects_of(known.candidates, (best,), fit)
-            nearest = f"{effect.label} ({effect.words})"
+            ((_, theta, covariance),) = parts_of(known.candidates, (best,), fit)
+            found_there = known.candidates[best].fitted(theta, covariance)
+            # From responses to small steps: without an error, which a large one has beyond that of the noise.
+            nearest = f"{known.candidates[best].title} (about {found_there.describe()})"
         except InputError:
             nearest = known.candidates[best].title
     accepted = tuple(name for name in source.effects if name in {one.name for one in known.candidates})
