@@ -25,6 +25,7 @@ class State:
     scene: Scene | None
     maps: Maps
     others: Sequence[ChannelPair]  #: the other channels
+    floor: float = 0.0  #: rms in uK up to which maps are called identical
     #: orthonormal changes of the prediction that are fitted besides, over the pixels that are seen, shape (k, n)
     free: NDArray[np.float64] | None = None
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import healpy
 import numpy as np
+from numpy.typing import NDArray
 
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.looks import neighbours
@@ -16,6 +17,12 @@ from mcsim.support.arrays import Vector
 
 SCREENED = 50_000  #: pixels on which orders of pixels are compared at most
 ALIKE = 0.5  #: correlation of neighbouring pixels from which on maps are no noise
+
+OWN = 0.3
+"""Rms by which the sides of a channel that was not exchanged differ at most.
+
+It is counted over that by which its side B differs from side A of the channel whose maps it might have.
+"""
 
 MORE_ALIKE = 0.2
 """By how much mirrored maps must correlate more with side B: maps of different skies do so by chance, or a little."""
@@ -238,10 +245,24 @@ class ChannelExchanged(Difference):
     needs_scene = counted = False
 
     def starts(self, state: State) -> list[Vector]:
-        return [np.array([float(i)]) for i, other in enumerate(state.others) if other.a.shape == state.maps.shape]
+        """Return the numbers of the channels whose sides differ, if one of all may have this channel's maps."""
+        alike = [(i, other) for i, other in enumerate(state.others) if other.a.shape == state.maps.shape]
+        if all(_kept(other, state.pair) for _, other in alike):
+            return []
+        return [np.array([float(i)]) for i, other in alike if _rms(other.b - other.a, other.seen) > state.floor]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         return _complete(state.others[int(value[0])].a, state)
+
+
+def _kept(other: ChannelPair, pair: ChannelPair) -> bool:
+    """Return True if another channel's side B is its own side A rather than that of a pair."""
+    seen = other.seen & pair.shown
+    return _rms(other.b - other.a, seen) < OWN * _rms(other.b - pair.a, seen)
+
+
+def _rms(maps: Maps, seen: NDArray[np.bool_]) -> float:
+    return float(np.sqrt(np.mean(maps[seen] ** 2))) if seen.any() else 0.0
 
 
 def _is_noise(maps: Maps, state: State) -> bool:

@@ -110,7 +110,7 @@ class Prediction:
             maps = maps + (scene.maps() - self._bare)
         if correction is not None:
             maps = maps + correction
-        state = State(self.pair, scene, maps, self.others)
+        state = State(self.pair, scene, maps, self.others, self.floor)
         for difference, value in members:
             state = replace(state, maps=difference.maps(state.maps, value, state))
         return state

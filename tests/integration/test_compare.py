@@ -189,6 +189,19 @@ def test_channels_exchanged_or_with_the_same_noise_are_named():
     assert found.channels[1].differences[0].amplitude == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.parametrize("factor", [1.0, 1.002])
+def test_a_channel_that_has_its_own_maps_was_not_exchanged(factor):
+    """The other channel shows another sky, and nothing else would be like its side A as the first channel is."""
+    channel = small(beam=mcsim.Beam.gaussian(380.0, 32))["channel"][0]
+    simulator = Simulator(small() | {"channel": [channel, {**channel, "name": "W2"}]})
+    one, other = simulator(), simulator(sky=np.roll(simulator.sky, 40))
+    found = mcsim.compare([*one, *one], [*scaled(one, factor), *other], simulator.run)
+    assert [channel.verdict for channel in found.channels] == [
+        "identical" if factor == 1.0 else "difference",
+        "unknown",
+    ]
+
+
 def test_stripes_of_a_binned_map_are_those_that_a_destriper_takes_off():
     simulator = Simulator(small())
     draw = np.random.default_rng(4)
