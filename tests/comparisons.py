@@ -106,6 +106,13 @@ def scaled(maps: Maps, factor: float) -> Maps:
     return [np.where(m > -1e20, factor * m, m) for m in maps]
 
 
+def noise_of(simulator: Simulator) -> Maps:
+    """Return noise of 60 uK a sample for every map."""
+    draw = np.random.default_rng(6)
+    hits = [m.moments.hits for m in survey(simulator.run).making.channels[0].maps]
+    return [60.0 * draw.standard_normal(h.size) / np.sqrt(np.maximum(h, 1.0)) for h in hits]
+
+
 SMALL = MODEL | {"sky": {"spectrum": "wmap7", "lmax": 32}, "map": {"nside": 16, "splits": ["half1", "half2"]}}
 PEAR = mcsim.Beam.elliptical(400.0, 320.0, angle_deg=20.0, lmax=32, mmax=3)
 PEAR.blm[1] += 0.2 * np.exp(0.7j) * PEAR.blm[0] * (np.arange(33) / 32) ** 3

@@ -273,6 +273,22 @@ def _is_noise(maps: Maps, state: State) -> bool:
     return bool(alike) and min(alike) < ALIKE
 
 
+def _has_noise(pair: ChannelPair) -> bool:
+    return pair.noise_uk is not None and bool(pair.noise_uk.any())
+
+
+def _of_both(noise: Maps, value: Vector, state: State) -> bool:
+    """Return True if other noise less a map's own is not that alone, as it is where one side has none."""
+    pair, (changed, source) = state.pair, value[1:3].astype(int)
+    assert pair.noise_uk is not None
+    there = state.others[source].noise_uk if changed < 0 else pair.noise_uk[[source]]
+    own = pair.noise_uk if changed < 0 else pair.noise_uk[[changed]]
+    assert there is not None
+    expected = np.sum(own**2) / (np.sum(own**2) + np.sum(there**2))
+    rest = pair.a - (0.0 if pair.scene is None else pair.scene.maps())
+    return -float(np.sum(noise * rest)) < 0.5 * (1.0 + expected) * float(np.sum(noise**2))
+
+
 class NoiseShared(Difference):
     """One split of side B has noise in common with another one, or all have with another channel."""
 
@@ -285,16 +301,24 @@ class NoiseShared(Difference):
     def starts(self, state: State) -> list[Vector]:
         """Return correlation, split that is changed (-1: all), split or channel that it is shared with, and how.
 
-        Noise of the same samples, or of the same deviates and other hits; from maps, or less the sky simulated.
+        Noise of the same samples, or of the same deviates and other hits; from maps, or less the sky simulated. Only
+        what the model says to be noise is shared.
         """
+        if not _has_noise(state.pair):
+            return []
         count = len(state.maps)
         splits = [(j, i) for j in range(count) for i in range(count) if i != j]
-        channels = [(-1, k) for k, other in enumerate(state.others) if other.a.shape == state.maps.shape]
+        alike = [(k, other) for k, other in enumerate(state.others) if other.a.shape == state.maps.shape]
+        channels = [(-1, k) for k, other in alike if _has_noise(other)]
         simulated = [] if state.pair.scene is None else [(1, 0), (1, 1)]
         ways = [(*pair, *manner) for pair in splits for manner in [(0, 0), (0, 1), *simulated]]
         ways += [(*pair, *manner) for pair in channels for manner in simulated]  # as they are, they are exchanged
         made = [(np.array([0.0, *way]), self._exchanged(np.array([0.0, *way]), state)) for way in ways]
-        return [value + np.eye(5)[0] * state.fit([maps]) for value, maps in made if _is_noise(maps, state)]
+        return [
+            value + np.eye(5)[0] * state.fit([maps])
+            for value, maps in made
+            if _is_noise(maps, state) and _of_both(maps, value, state)
+        ]
 
     def _exchanged(self, way: Vector, state: State) -> Maps:
         """Return other noise less a map's own: the difference of the maps, less that of the sky in them."""

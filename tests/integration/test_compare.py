@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 import mcsim
-from comparisons import CASES, LMAX, MODEL, NSIDE, ODD, PEAR, Maps, Simulator, names, scaled, small
+from comparisons import CASES, LMAX, MODEL, NSIDE, ODD, PEAR, Maps, Simulator, names, noise_of, scaled, small
 from mcsim import config
 from mcsim.comparison import pairs
 from mcsim.comparison.description import with_known_offsets
@@ -184,9 +184,21 @@ def test_channels_exchanged_or_with_the_same_noise_are_named():
     draw = np.random.default_rng(3)
     noise = [20.0 * draw.standard_normal(m.size) for m in clean]
     side_a = [m + n for m, n in zip(clean, noise, strict=True)]
-    found = mcsim.compare(side_a, [*side_a[:2], clean[2] + noise[0], clean[3] + noise[1]], one.run)
+    noisy = replace(one.run, channels=tuple(replace(c, noise=config.Noise(sigma0_uk=250.0)) for c in one.run.channels))
+    found = mcsim.compare(side_a, [*side_a[:2], clean[2] + noise[0], clean[3] + noise[1]], noisy)
     assert [(d.name, d.channel) for c in found.channels for d in c.differences] == [("noise_shared", "W2")]
     assert found.channels[1].differences[0].amplitude == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("sigma0_uk", [0.0, 60.0])
+def test_noise_of_one_channel_on_one_side_is_not_shared(sigma0_uk):
+    """The maps without it are those with it, less their own noise and with none of the other channel's."""
+    channel = small(beam=mcsim.Beam.gaussian(380.0, 32))["channel"][0] | {"noise": {"sigma0_uk": sigma0_uk}}
+    simulator = Simulator(small() | {"channel": [channel, {**channel, "name": "W2"}]})
+    clean = simulator()
+    noisy = [m + n for m, n in zip(clean, noise_of(simulator), strict=True)]
+    found = mcsim.compare([*clean, *clean], [*noisy, *clean], simulator.run)
+    assert [channel.verdict for channel in found.channels] == ["unknown", "identical"]
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.002])

@@ -124,6 +124,8 @@ def test_what_a_wrong_beam_leaves_of_the_sky_is_no_noise():
     sky = [healpy.smoothing(one, np.deg2rad(10.0)) for one in noise]
     for maps, expected in ((noise, 2), (np.stack(sky), 0)):
         pair = ChannelPair("W", ("W:a", "W:b"), maps, maps[::-1], np.ones(maps.shape, bool))
+        assert len(NoiseShared().starts(State(pair, None, maps, ()))) == 0, "no model says that this is noise"
+        pair = replace(pair, noise_uk=np.ones(maps.shape))
         assert len(NoiseShared().starts(State(pair, None, maps, ()))) == 2 * expected
 
 

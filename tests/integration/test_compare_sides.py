@@ -9,7 +9,22 @@ import pytest
 from typer.testing import CliRunner
 
 import mcsim
-from comparisons import CASES, LMAX, MODEL, NSIDE, ODD, PEAR, SMALL, Maps, Simulator, mcsim_window, names, scaled, small
+from comparisons import (
+    CASES,
+    LMAX,
+    MODEL,
+    NSIDE,
+    ODD,
+    PEAR,
+    SMALL,
+    Maps,
+    Simulator,
+    mcsim_window,
+    names,
+    noise_of,
+    scaled,
+    small,
+)
 from mcsim.cli import app
 from mcsim.comparison import pairs
 from mcsim.comparison.prediction import Prediction, Set
@@ -258,13 +273,6 @@ def test_differencing_scans_are_refused():
     }
     with refused("differencing", "W1"):
         mcsim.compare([np.zeros(3072)] * 2, [np.ones(3072)] * 2, SMALL | {"channel": [channel]})
-
-
-def noise_of(simulator: Simulator) -> Maps:
-    """Return noise of 60 uK a sample for every map."""
-    draw = np.random.default_rng(6)
-    hits = [m.moments.hits for m in survey(simulator.run).making.channels[0].maps]
-    return [60.0 * draw.standard_normal(h.size) / np.sqrt(np.maximum(h, 1.0)) for h in hits]
 
 
 @pytest.mark.parametrize("other", [PsiSign(), SpinSign()])

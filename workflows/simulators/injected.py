@@ -31,6 +31,10 @@ from mcsim.sphere.healpix import pixel_window
 from mcsim.sphere.rotation import rotate_alm
 
 
+NOISE_UK = 60.0
+"""Noise of a sample, where it is shared."""
+
+
 def turned(sky: Vector, degrees: float) -> Vector:
     """Return a sky turned about the z axis."""
     return sky * np.exp(-1j * healpy.Alm.getlm(LMAX)[1] * np.deg2rad(degrees))
@@ -56,7 +60,7 @@ def changes(given: inputs.Inputs, scan: str) -> dict[str, tuple[dict[str, Any], 
 
     def noise(share: float) -> dict[str, Any]:
         draw = np.random.default_rng(5)
-        own = {name: 60.0 * draw.standard_normal(NPIX) for name in names}
+        own = {name: NOISE_UK * draw.standard_normal(NPIX) for name in names}
         first = dict.fromkeys(names, own[names[0]])
         return {"noise": {n: (1.0 - share) * own[n] + share * first[n] for n in names}}
 
@@ -136,6 +140,8 @@ def prepared(scan: str, shape: str, names: tuple[str, ...], sizes: tuple[int, ..
     """Return the run of a case, the noise of both sides, and the changes of side B."""
     channels = ("T", "U") if "channel_exchanged" in names else ("T",)
     run = run_of(scan, "circular" if "interpolation" in names else shape, channels, seed)
+    if "noise_shared" in names:
+        run = replace(run, channels=tuple(replace(c, noise=config.Noise(sigma0_uk=NOISE_UK)) for c in run.channels))
     table = changes(inputs.of(run), scan)
     noise = {"base": table["noise_shared"][0]["base"] if shape == "ellipse noisy" else {}}
     return run, noise, [table[name][size] for name, size in zip(names, sizes, strict=True)]
