@@ -219,8 +219,9 @@ class SplitExchanged(Difference):
     exchanges = True
 
     def starts(self, state: State) -> list[Vector]:
-        count = len(state.maps)
-        return [np.array([float(i), float(j)]) for i in range(count) for j in range(i)]
+        """Return all pairs of splits that both differ."""
+        differing = np.flatnonzero(state.pair.seen.any(axis=1))
+        return [np.array([float(i), float(j)]) for i in differing for j in differing if j < i]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         return _complete(self.undone(maps, value), state)

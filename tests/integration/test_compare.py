@@ -190,6 +190,12 @@ def test_channels_exchanged_or_with_the_same_noise_are_named():
     assert found.channels[1].differences[0].amplitude == pytest.approx(1.0, abs=0.02)
 
 
+def test_a_split_that_has_its_own_map_was_not_exchanged():
+    simulator = Simulator(small(beam=mcsim.Beam.gaussian(380.0, 32)))
+    one, other = simulator(), simulator(sky=np.roll(simulator.sky, 40))
+    assert mcsim.compare([other[0], one[1]], one, simulator.run).verdict == "unknown"
+
+
 @pytest.mark.parametrize("sigma0_uk", [0.0, 60.0])
 def test_noise_of_one_channel_on_one_side_is_not_shared(sigma0_uk):
     """The maps without it are those with it, less their own noise and with none of the other channel's."""
