@@ -120,7 +120,7 @@ def compare(
         for number, pair in enumerate(sides.pairs):
             found.append(_channel(pair, sides, accuracy))
             progress(number + 1.0)
-    result = ComparisonResult(case, tuple(found))
+    result = ComparisonResult(case, tuple(found), sides.not_compared)
     if output is not None:
         Path(output).mkdir(parents=True, exist_ok=True)
         text = json.dumps(result.to_dict(), indent=1, allow_nan=False) + "\n"
@@ -256,6 +256,7 @@ def _result(
         seen=seen,
         one_sided=pair.one_sided,
         differing=pair.differing,
+        absent=pair.absent,
         spread_rms_uk=0.0 if pair.spread is None else _rms(pair.spread[seen]),
         hits=pair.hits,
         reversed=pair.turned,

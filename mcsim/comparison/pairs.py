@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.comparison.description import SAMPLES, check_splits, in_full, orders_of, quiet, with_known_offsets
+from mcsim.comparison.missing import not_compared
+from mcsim.comparison.result import NotCompared
 from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of
 from mcsim.comparison.sky_of_maps import sky_in
 from mcsim.ensemble.external import named_source, source_of
@@ -48,6 +50,7 @@ class ChannelPair:
     a: Maps
     b: Maps
     seen: NDArray[np.bool_]  #: what both sides observed, shape (split, npix)
+    absent: tuple[str, ...] = ()  #: names of the maps that one side lacks, which are holes on both
     one_sided: int = 0  #: number of pixels that one side alone observed
     scene: Scene | None = None  #: what the model says of side A; None without a model
     #: the same with everything that effects need, before any preparation; None without a model
@@ -121,6 +124,7 @@ class Comparison:
 
     pairs: tuple[ChannelPair, ...]
     run: config.RunConfig | None
+    not_compared: tuple[NotCompared, ...] = ()  #: maps that one side, or the model, lacks
 
     @property
     def frame(self) -> str:
@@ -153,7 +157,7 @@ def read(
     if run is None:
         groups = {name: [name] for name in sides[0] if name in sides[1]}
     else:
-        groups = {c: names for c, names in _groups(run).items() if all(n in side for n in names for side in sides)}
+        groups = {c: names for c, names in _groups(run).items() if any(all(n in s for s in sides) for n in names)}
     if not groups:
         raise InputError(
             f"{a} and {b} have no channel in common; give both maps of the same names, CHANNEL.fits or "
@@ -161,7 +165,8 @@ def read(
         )
     found = (_pair(name, maps, sides, whole, nthreads) for name, maps in groups.items())
     pairs = (replace(pair, orders=orders.get(pair.name)) for pair in found)
-    return Comparison(tuple(pair if run is None else _with_noise(pair, run) for pair in pairs), run)
+    noisy = tuple(pair if run is None else _with_noise(pair, run) for pair in pairs)
+    return Comparison(noisy, run, not_compared((a, b), sides, run))
 
 
 def _check_kind(side: str | Path) -> None:
@@ -339,21 +344,23 @@ def _without_holes(map_uk: NDArray[np.float64]) -> NDArray[np.float64]:
 def _pair(
     name: str, maps: Sequence[str], sides: Sequence[dict[str, NDArray[np.float64]]], whole: Survey | None, nthreads: int
 ) -> ChannelPair:
-    found = {check_map(side[m], name=f"map {m}") for side in sides for m in maps}
+    absent = tuple(m for m in maps if not all(m in side for side in sides))
+    found = {check_map(side[m], name=f"map {m}") for side in sides for m in maps if m not in absent}
     if len(found) > 1:
         nsides = " and ".join(str(nside) for nside in sorted(found))
         raise InputError(f"the maps of {name} have nside {nsides}; bring them to the same.")
-    whole_sides = (np.stack([side[m] for m in maps]).astype(np.float64) for side in sides)
+    hole, there = np.full(12 * min(found) ** 2, healpy.UNSEEN), np.array([m not in absent for m in maps])
+    whole_sides = (np.stack([hole if m in absent else side[m] for m in maps]).astype(np.float64) for side in sides)
     a, b = (np.stack([_without_holes(one) for one in side]) for side in whole_sides)
     observed = [side != healpy.UNSEEN for side in (a, b)]
     for side, here in zip("AB", observed, strict=True):
-        if not here.any(axis=1).all():
+        if not here.any(axis=1)[there].all():
             raise InputError(
                 f"a map of {name} on side {side} has no data: all of it is NaN or UNSEEN; give its values."
             )
     seen, one_sided = observed[0] & observed[1], int(np.sum(observed[0] != observed[1]))
     if whole is None:
-        return ChannelPair(name, tuple(maps), a, b, seen, one_sided)
+        return ChannelPair(name, tuple(maps), a, b, seen, absent, one_sided)
     finished, channel = (next(c for c in one.channels if c.name == name) for one in (whole, whole.making))
     if channel.side_b is not None:
         raise InputError(
@@ -370,7 +377,7 @@ def _pair(
     for index, m in enumerate(finished.maps):
         if m.weight is not None:
             seen[index] &= m.weight > 0
-    if not seen.any(axis=1).all():
+    if not seen.any(axis=1)[there].all():
         raise InputError(f"the maps of {name} have no pixel in common with each other and the model; check the scan.")
     sky = whole.config.sky
     named = sky.alm is not None or sky.map is not None
@@ -382,7 +389,7 @@ def _pair(
         splits = whole.config.map.splits or (None,)
         paths = tuple(config.channel_path(spec.scan.path, name, split) for split in splits)
         files = PointingFiles(paths, channel.site.frame)
-    pair = ChannelPair(name, tuple(maps), a, b, seen, one_sided, scene, channel, hits, not named, files)
+    pair = ChannelPair(name, tuple(maps), a, b, seen, absent, one_sided, scene, channel, hits, not named, files)
     return pair if named else pair.with_sky_of_maps()
 
 

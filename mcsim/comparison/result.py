@@ -42,6 +42,24 @@ class DifferenceResult:
         return own | ({"parameters": self.parameters} if self.parameters else {})
 
 
+@dataclass(frozen=True)
+class NotCompared:
+    """A map that was not compared: name, and what lacks it of "a", "b" and "model"."""
+
+    map: str
+    missing_on: tuple[str, ...]
+
+    @property
+    def words(self) -> str:
+        """Name, and what lacks it."""
+        where = "the model" if self.missing_on == ("model",) else f"side {' and side '.join(self.missing_on).upper()}"
+        return f"{self.map}, which {where} lacks"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as in ``compare.json``."""
+        return {"map": self.map, "missing_on": list(self.missing_on)}
+
+
 @dataclass(frozen=True, eq=False)
 class ChannelResult:
     """The comparison of one channel."""
@@ -74,7 +92,10 @@ class ChannelResult:
     seen: NDArray[np.bool_]
     one_sided: int  #: number of pixels that one side alone observed, and that are left out
     hits: Maps | None  #: samples per pixel, of the model; None without one
-    differing: tuple[str, ...] = ()  #: names of the maps that differ at all, of which the rest is said
+    #: differing, absent: names of the maps that differ at all, of which the rest is said, and of those that one side
+    #: lacks
+    differing: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()
     #: of what single samples change in side A, if that was made from orientation moments; it is taken off first
     spread_rms_uk: float = 0.0
     #: True if the model describes side B, and the differences were found in side A; they say B relative to A
@@ -90,12 +111,17 @@ class ChannelResult:
         """Share of the variance of the difference that is left."""
         return (self.left_rms_uk / self.rms_uk) ** 2 if self.rms_uk > 0.0 else 0.0
 
+    @property
+    def partly(self) -> bool:
+        """True if some maps are identical, and others are not."""
+        return len(self.differing) + len(self.absent) < len(self.splits)
+
     def sentence(self) -> str:
         """Say what was found in this channel."""
         more = f" {self.one_sided} pixels that one side alone observed are left out." if self.one_sided else ""
         if self.spread_rms_uk:
             more += f" What single samples change in side A, {number(self.spread_rms_uk)} uK rms, is taken off first."
-        if len(self.differing) < len(self.splits):
+        if self.partly:
             more += f" That is {', '.join(self.differing)}; the other maps are identical."
         return self._found() + more
 
@@ -139,6 +165,8 @@ class ComparisonResult:
         Name.
     channels
         One result for every channel.
+    not_compared
+        Maps that one side, or the model, lacks.
 
     Examples
     --------
@@ -152,6 +180,7 @@ class ComparisonResult:
 
     case: str
     channels: tuple[ChannelResult, ...]
+    not_compared: tuple[NotCompared, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -199,12 +228,18 @@ class ComparisonResult:
                 "looks": {c.name: list(c.looks) for c in self.channels if c.looks},
                 "single_samples_uk": {c.name: c.spread_rms_uk for c in self.channels if c.spread_rms_uk},
             },
-            "maps": {c.name: list(c.differing) for c in self.channels if len(c.differing) < len(c.splits)},
+            "maps": {c.name: list(c.differing) for c in self.channels if c.partly},
+            "not_compared": [one.to_dict() for one in self.not_compared],
         }
 
     def __str__(self) -> str:
         """Say what was found, channel by channel."""
-        return "\n".join([f"{self.case}: {self.verdict}", *(channel.sentence() for channel in self.channels)])
+        return "\n".join([f"{self.case}: {self.verdict}", *self.sentences()])
+
+    def sentences(self) -> list[str]:
+        """Return a sentence for every channel, and one about what was not compared."""
+        rest = "; ".join(one.words for one in self.not_compared)
+        return [*(channel.sentence() for channel in self.channels), *([f"Not compared: {rest}."] if rest else [])]
 
 
 def _ratio(value: float, unit: float) -> float | None:

@@ -176,10 +176,11 @@ def _weight(pair: ChannelPair) -> Maps | None:
     """
     if pair.scene is None or pair.hits is None or pair.scene.preparations:
         return None
-    whole = len(pair.a) > 1
-    seen = pair.seen[:2].all(axis=0)
-    rest = _missing(pair)[:2, seen]
-    mean = pair.a[:2, seen].mean(axis=0)
+    first = np.flatnonzero(pair.seen.any(axis=1))[:2]
+    whole = first.size > 1
+    seen = pair.seen[first].all(axis=0)
+    rest = _missing(pair)[first][:, seen]
+    mean = pair.a[first][:, seen].mean(axis=0)
     freedom = 1.0 if whole else 1.0 - _coefficients(pair.scene, pair.nside) / max(int(seen.sum()), 1)
     if freedom < FREE:
         return None
@@ -190,7 +191,7 @@ def _weight(pair: ChannelPair) -> Maps | None:
     found = []
     for power in (1.0, 0.0):
         shape = np.maximum(pair.hits, 1.0) ** power
-        spread = np.sum(1.0 / shape[:2, seen], axis=0)
+        spread = np.sum(1.0 / shape[first][:, seen], axis=0)
         variance = float(np.mean(noise**2 / spread))
         found.append((float(np.mean(np.log(variance * spread))), np.where(pair.seen, shape / variance, 0.0)))
     return min(found, key=lambda one: one[0])[1]

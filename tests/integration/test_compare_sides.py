@@ -26,7 +26,7 @@ from comparisons import (
     small,
 )
 from mcsim.cli import app
-from mcsim.comparison import pairs
+from mcsim.comparison import pairs, report
 from mcsim.comparison.prediction import Prediction, Set
 from mcsim.comparison.scene import Scene
 from mcsim.comparison.scene_differences import PsiSign, SpinSign, TimeShift
@@ -181,6 +181,29 @@ def test_files_are_compared_from_the_command_line(tmp_path, simulator, side_a):
     assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
     with quick_pictures(empty=True):
         assert CliRunner().invoke(app, ["compare", a, b, "-o", out, "--fail-above", "1e-4"]).exit_code == 1
+
+
+@pytest.mark.parametrize("of", ["a", "b"])
+def test_maps_that_one_side_alone_has_are_said(tmp_path, of, side_a):
+    """The split that both have is compared, and one that is missing was not exchanged for it."""
+    for side, maps in (("a", side_a), ("b", scaled(side_a, 1.01))):
+        (tmp_path / side).mkdir()
+        for split, map_ in zip(("half1", "half2")[: 1 if side == of else 2], maps, strict=False):
+            write_map(tmp_path / side / f"W1_{split}.fits", map_, "ecliptic")
+    write_map(tmp_path / "b" / "X1.fits", side_a[0], "ecliptic")
+    with pytest.warns(UserWarning, match="W1:half2, which side . lacks; X1, which the model lacks"):
+        found = mcsim.compare(tmp_path / "a", tmp_path / "b", MODEL)
+    assert names(found) == ["calibration"]
+    assert found.to_dict()["maps"] == {}
+    assert found.to_dict()["not_compared"] == [
+        {"map": "W1:half2", "missing_on": [of]},
+        {"map": "X1", "missing_on": ["model"]},
+    ]
+    assert "Not compared: W1:half2" in str(found)
+    with quick_pictures():
+        assert "W1:half2, which side" in report.page(found)
+    with pytest.warns(UserWarning, match=f"W1_half2, which side {of.upper()} lacks"):
+        mcsim.compare(tmp_path / "a", tmp_path / "b")
 
 
 @pytest.mark.parametrize(

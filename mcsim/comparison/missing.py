@@ -1,0 +1,42 @@
+"""Maps that one side alone has, or that no model describes."""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from mcsim import config
+from mcsim.comparison.result import NotCompared
+from mcsim.ensemble.maps import file_names, first_realization
+
+
+def not_compared(
+    paths: Sequence[str | Path], sides: Sequence[Mapping[str, object]], run: config.RunConfig | None
+) -> tuple[NotCompared, ...]:
+    """Return the maps of the model or of a side that are not compared, and warn of them."""
+    wanted = () if run is None else config.map_names(run)
+    present = [_names(path, side, run) for path, side in zip(paths, sides, strict=True)]
+    found = tuple(_lacking(wanted, *present))
+    if found:
+        warnings.warn(
+            f"not compared: {'; '.join(one.words for one in found)}; give both sides, and the model, the same channels "
+            "and splits.",
+            stacklevel=4,
+        )
+    return found
+
+
+def _lacking(wanted: Sequence[str], a: set[str], b: set[str]) -> Iterator[NotCompared]:
+    for name in dict.fromkeys((*wanted, *sorted(a | b))):
+        unknown = ("model",) if wanted and name not in wanted else ()
+        sides = unknown or tuple(label for label, own in (("a", a), ("b", b)) if name not in own)
+        if sides:
+            yield NotCompared(name, sides)
+
+
+def _names(path: str | Path, side: Mapping[str, object], run: config.RunConfig | None) -> set[str]:
+    """Return the names of all maps of a side; those of files that are no map of the model's are the files'."""
+    if not Path(path).is_dir():
+        return set(side)
+    known = set() if run is None else set(file_names(run).values())
+    others = {file.stem for file in first_realization(Path(path)).glob("*.fits") if file.name not in known}
+    return set(side) | others
