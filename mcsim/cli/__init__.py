@@ -272,7 +272,10 @@ def compare(
     b: Annotated[Path, typer.Argument(metavar="B", help="The same skies from another simulation.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the result and report.")],
     model: Annotated[
-        Path | None, typer.Option(metavar="CONFIG", help="What A simulates; default: model.toml in or beside A or B.")
+        Path | None,
+        typer.Option(
+            metavar="CONFIG", help="What A simulates; default: a side that is one, model.toml in A or B, or beside."
+        ),
     ] = None,
     accuracy: Annotated[float, typer.Option(help="Rms over the sky's up to which maps may be identical.")] = 1e-3,
     fail_above: Annotated[

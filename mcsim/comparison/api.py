@@ -59,7 +59,8 @@ def compare(
         first is compared; configurations, of which realization 0 is simulated; or arrays, shape (npix,) each, by name
         ("channel" or "channel:split") or in the order of the model's maps.
     model
-        Run that describes side A: beams, scans, nside, lmax; by default ``model.toml`` in the folders or beside them.
+        Run that describes side A: beams, scans, nside, lmax; by default side A or B if it is a configuration, or
+        ``model.toml`` in its folder; else ``model.toml`` beside side A.
         Without one, only differences of the maps themselves are tried: units, calibration, monopole, dipole, order of
         the pixels, exchanged files.
     output

@@ -144,13 +144,13 @@ def read(
     """
     for side in (a, b):
         _check_kind(side)
-    run = _model(a, b, model)
+    run, described = _model(a, b, model)
     whole: Survey | None = None
     orders: dict[str, int] = {}
     if run is not None:
         run, orders = in_full(run)
         whole = survey(quiet(run), nthreads, orders=orders_of(run))
-    sides = [_side(side, run, nthreads) for side in (a, b)]
+    sides = [_side(side, run, described, nthreads) for side in (a, b)]
     for own, other, side in ((0, 1, a), (1, 0, b)):
         if not Path(side).is_dir() and _made_elsewhere((b, a)[own]):
             sides[own] = _closer(sides[own], sides[other], config.load(side), nthreads)
@@ -213,35 +213,42 @@ def _in_order(side: Given, names: Sequence[str]) -> Sequence[NDArray[np.float64]
     return [reals(one, f"map {name}", healpy.UNSEEN) for name, one in zip(names, side, strict=True)]
 
 
-def _model(a: str | Path, b: str | Path, model: str | Path | config.RunConfig | None) -> config.RunConfig | None:
+def _model(
+    a: str | Path, b: str | Path, model: str | Path | config.RunConfig | None
+) -> tuple[config.RunConfig | None, str]:
+    """Return the run that describes side A, if one does, and its name in messages."""
     if isinstance(model, config.RunConfig):
-        return model
+        return model, model.name
     found: str | Path | None = model
     if found is None:
-        beside = [Path(side) / "model.toml" for side in (a, b)] + [Path(a).absolute().parent / "model.toml"]
-        found = next((path for path in beside if path.is_file()), None)
+        own = [Path(side) / "model.toml" if Path(side).is_dir() else side for side in (a, b)]
+        beside = Path(a).absolute().parent / "model.toml"
+        found = next((one for one in (*own, beside) if one in (a, b) or Path(one).is_file()), None)
     if found is None:
-        found = next((side for side in (a, b) if not Path(side).is_dir()), None)
-    if found is None:
-        return None
+        return None, ""
     run = config.load(found)
     if run.map.grid != "healpix":
         raise InputError(f'{run.name} has map.grid = "{run.map.grid}" and so no pixels; set map.grid = "healpix".')
-    return run
+    return run, str(found)
 
 
-def _side(side: str | Path, run: config.RunConfig | None, nthreads: int) -> dict[str, NDArray[np.float64]]:
-    """Return the maps of a side by name, uK."""
+def _side(
+    side: str | Path, run: config.RunConfig | None, described: str, nthreads: int
+) -> dict[str, NDArray[np.float64]]:
+    """Return the maps of a side by name, uK; ``described`` is the model's name in messages."""
     path = Path(side)
     if path.is_dir():
-        return _folder(path, run)
+        return _folder(path, run, described)
     own, external = named_source(config.load(side))
     check_splits(own)
     wanted = own_frame = config.prepared_grid(own)[1]
     if run is not None:
         wanted = config.prepared_grid(run)[1]
     if own_frame != wanted:
-        raise InputError(f"{side} makes maps in {own_frame} coordinates, the model in {wanted}; choose one.")
+        raise InputError(
+            f"{side} makes maps in {own_frame} coordinates, the model {described} in {wanted}; give both the same "
+            "map.frame, or the model of these maps with --model."
+        )
     if external is not None:
         return _external(quiet(own), external, nthreads)
     shared = survey(with_known_offsets(own), nthreads)
@@ -306,7 +313,7 @@ def _by_samples(run: config.RunConfig, nthreads: int) -> dict[str, NDArray[np.fl
         return None
 
 
-def _folder(folder: Path, run: config.RunConfig | None) -> dict[str, NDArray[np.float64]]:
+def _folder(folder: Path, run: config.RunConfig | None, described: str) -> dict[str, NDArray[np.float64]]:
     folder = first_realization(folder)
     names = {path.stem: path for path in sorted(folder.glob("*.fits"))}
     frequencies: dict[str, float | None] = {}
@@ -322,7 +329,8 @@ def _folder(folder: Path, run: config.RunConfig | None) -> dict[str, NDArray[np.
         map_, frame, unit = healpix.read_map(path)
         if run is not None and frame not in (None, config.prepared_grid(run)[1]):
             raise InputError(
-                f"{path} is in {frame} coordinates, the model in {config.prepared_grid(run)[1]}; rotate the model."
+                f"{path} is in {frame} coordinates, the model {described} in {config.prepared_grid(run)[1]}; set its "
+                "map.frame, or give the model of these maps with --model."
             )
         factor = header.to_uk(unit, path, frequencies.get(name))
         found[name] = np.where(map_ > UNSEEN_BELOW, factor * map_, healpy.UNSEEN)

@@ -190,6 +190,23 @@ def test_a_configuration_beside_another_simulator_has_all_orders(tmp_path, whole
     assert found.channels[0].left < 1e-3
 
 
+def test_a_configuration_that_is_a_side_describes_it_whatever_lies_beside(tmp_path):
+    texts = [DESCRIPTION, DESCRIPTION.replace("angle_deg = 20.0", "angle_deg = 21.0")]
+    texts.append(DESCRIPTION.replace("nside = 16", 'nside = 16\nframe = "galactic"'))
+    a, b, model = (tmp_path / name for name in ("a.toml", "b.toml", "model.toml"))
+    for path, text in zip((a, b, model), texts, strict=True):
+        path.write_text(text)
+    found = mcsim.compare(a, b)
+    assert names(found) == ["psi_offset"]
+    assert found.channels[0].differences[0].amplitude == pytest.approx(1.0, abs=0.01)
+    with refused(a, "ecliptic", model, "galactic", "--model"):
+        mcsim.compare(a, b, model)
+    [folder] = mcsim.write_maps(a, tmp_path / "maps", realizations=0)
+    with refused(folder, "ecliptic", model, "galactic", "--model"):
+        mcsim.compare(folder, folder)
+    assert mcsim.compare(folder, a).verdict == "identical"
+
+
 @pytest.mark.parametrize("name", ["maps.zarr", "W1.fits", "maps.npz"])
 def test_stored_maps_are_named_in_a_configuration(tmp_path, name):
     if name.endswith(".zarr"):
