@@ -333,7 +333,7 @@ def _folder(folder: Path, run: config.RunConfig | None, described: str) -> dict[
                 "map.frame, or give the model of these maps with --model."
             )
         factor = header.to_uk(unit, path, frequencies.get(name))
-        found[name] = np.where(map_ > UNSEEN_BELOW, factor * map_, healpy.UNSEEN)
+        found[name] = np.where((map_ > UNSEEN_BELOW) | np.isinf(map_), factor * map_, healpy.UNSEEN)
     return found
 
 
@@ -349,11 +349,20 @@ def _without_holes(map_uk: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(known, map_uk, healpy.UNSEEN)
 
 
+def _checked(map_uk: NDArray[np.float64], name: str) -> int:
+    """Return nside of a map; raise InputError if that is none, or if pixels are infinite."""
+    nside = check_map(map_uk, name=name)
+    if infinite := int(np.isinf(map_uk).sum()):
+        raise InputError(f"{name} has {infinite} pixels that are infinite; mark what was not observed as UNSEEN.")
+    return nside
+
+
 def _pair(
     name: str, maps: Sequence[str], sides: Sequence[dict[str, NDArray[np.float64]]], whole: Survey | None, nthreads: int
 ) -> ChannelPair:
     absent = tuple(m for m in maps if not all(m in side for side in sides))
-    found = {check_map(side[m], name=f"map {m}") for side in sides for m in maps if m not in absent}
+    labelled = tuple(zip("AB", sides, strict=True))
+    found = {_checked(side[m], f"map {m} on side {label}") for label, side in labelled for m in maps if m not in absent}
     if len(found) > 1:
         nsides = " and ".join(str(nside) for nside in sorted(found))
         raise InputError(f"the maps of {name} have nside {nsides}; bring them to the same.")

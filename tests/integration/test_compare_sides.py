@@ -248,6 +248,18 @@ def test_sloppy_maps_are_read(tmp_path, simulator, side_a):
         mcsim.compare([np.zeros(100)] * 2, side_a, simulator.run)
 
 
+@pytest.mark.parametrize("value", [np.inf, -np.inf])
+def test_infinite_pixels_are_refused(tmp_path, value, simulator, side_a):
+    broken = side_a[1].copy()
+    broken[[7, 30]] = value
+    with refused("W1:half2", "B", "2 pixels", "UNSEEN"):
+        mcsim.compare(side_a, [side_a[0], broken], simulator.run)
+    healpy.write_map(tmp_path / "W1_half1.fits", side_a[0], dtype=np.float64, column_units="uK")
+    healpy.write_map(tmp_path / "W1_half2.fits", broken, dtype=np.float64, column_units="uK")
+    with refused("W1_half2", "A", "2 pixels", "UNSEEN"):
+        mcsim.compare(tmp_path, tmp_path)
+
+
 def test_maps_with_holes_show_enough_of_the_sky():
     """Many pixels without a sample: psi of the other sign, and fewer orders, with no sky in the model."""
     simulator = Simulator(small("wmap", period_s=2503.0))
