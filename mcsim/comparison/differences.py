@@ -63,7 +63,7 @@ class Difference:
     #: True if the response is proportional to the value, which is then fitted at once
     proportional: ClassVar[bool] = False
     #: True if the response is the template of a small amplitude, and so no better than about a per mille
-    linear: ClassVar[bool] = False
+    linear: bool = False
     #: True if it exchanges pixels, files or units, which can be taken back before the rest is looked for
     exchanges: ClassVar[bool] = False
     #: True if it turns or mirrors samples or beam: what two of these make together neither says by itself

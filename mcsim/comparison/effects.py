@@ -23,8 +23,11 @@ from mcsim.support.arrays import Alm, Vector
 from mcsim.systematics import Effect
 from mcsim.systematics.registry import basis_of, catalogue
 
-REDUNDANT = ("calibration", "monopole_residual", "pixelization", "spectrum")
-"""calibration, monopole and pixel_centres are differences already; two sides have a sky, and its power, in common."""
+REDUNDANT = ("monopole_residual", "pixelization", "spectrum")
+"""monopole and pixel_centres are differences already; two sides have a sky, and its power, in common."""
+
+GAIN = "calibration"
+"""A factor of all that samples see, exact at any size: a difference already, but for a dipole that maps lack."""
 
 STAGES = ("sky", "beam", "pointing", "gain", "signal", "spread", "orientations")
 """Where an effect must act to change a map without noise."""
@@ -36,16 +39,17 @@ class EffectDifference(Difference):
     """An effect of the library, linear in its coordinates.
 
     The response of one that acts on beam or pointing is not larger than the sky: templates are those of small
-    amplitudes. Others are bounded as in a diagnosis.
+    amplitudes. Others, and a gain, are bounded as in a diagnosis.
     """
 
-    linear = proportional = True
+    proportional = True
     natural = 1e-9
     stage = 1
 
     def __init__(self, kind: type[Effect], templates: Maps, run: config.RunConfig, sky: Alm) -> None:
         self.kind, self.templates, self.run, self.sky = kind, templates, run, sky
         self.name, self.unit, self.met = kind.name, kind.unit, kind.cause
+        self.linear = kind.name != GAIN
         self._there: dict[tuple[bytes | float, ...], Maps] = {}
         self._products = np.tensordot(templates, templates, ((1, 2), (1, 2))) / templates[0].size
         power = healpy.alm2cl(sky)
@@ -57,7 +61,7 @@ class EffectDifference(Difference):
     def within(self, value: Vector) -> Vector:
         """Return the coordinates, or smaller ones in proportion whose response is possible."""
         size = float(value @ self._products @ value) / max(self._largest, 1e-300)
-        if not any(getattr(self.kind, stage) is not getattr(Effect, stage) for stage in BEAM_STAGES):
+        if not self.linear or all(getattr(self.kind, stage) is getattr(Effect, stage) for stage in BEAM_STAGES):
             highest = min([np.inf, *(max(-b.low, b.high) for b in self.kind.bounds if b.parameter == "amplitude")])
             size = (self.amplitude(value) / highest) ** 2
         return value / max(1.0, float(np.sqrt(size)))
@@ -169,7 +173,8 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
     bare = made(alone)
     for name, kind in catalogue().items():
         acts = any(getattr(kind, stage) is not getattr(Effect, stage) for stage in STAGES)
-        if kind.parametrization.stochastic or name in REDUNDANT or not kind.proposed or not acts:
+        redundant = name in REDUNDANT or (name == GAIN and not run.sky.dipole_uk)
+        if kind.parametrization.stochastic or redundant or not kind.proposed or not acts:
             continue
         templates = []
         try:

@@ -135,6 +135,19 @@ def test_an_effect_of_the_library_is_named(simulator, side_a):
     assert found.channels[0].differences[0].amplitude == pytest.approx(2.0, rel=0.03)
 
 
+@pytest.mark.parametrize("others", [{}, {"beam_ellipticity": 0.05}])
+def test_a_gain_that_leaves_a_part_of_the_dipole_is_named(others):
+    """It is no factor of the maps, from which the dipole is taken with a gain of 1, but like a ring's pick-up."""
+    dipole = {"dipole_uk": 3364.5, "dipole_lon_deg": 264.0, "dipole_lat_deg": 48.0}
+    wanted = {"calibration": 0.01, **others}
+    run = config.load(small(beam=mcsim.Beam.gaussian(380.0, 32)) | {"sky": MODEL["sky"] | dipole})
+    effects = tuple(config.Effect(name=n, channel="W1", parameters={"amplitude": v}) for n, v in wanted.items())
+    sides = (list(simulate.maps(survey(replace(run, effects=one)), 0)) for one in ((), effects))
+    found = mcsim.compare(*sides, run)
+    assert {d.name: d.amplitude for d in found.channels[0].differences} == pytest.approx(wanted, rel=0.01)
+    assert found.channels[0].left < 1e-6
+
+
 def test_powers_of_offsets_stand_for_samples_that_are_not_known(tmp_path):
     """Maps of the same sky are identical if a file of moments knows the offsets of the samples; no pointing."""
     beam = {"kind": "gaussian", "fwhm_arcmin": 180.0}
