@@ -33,9 +33,6 @@ Given = Sequence[NDArray[np.float64]] | Mapping[str, NDArray[np.float64]]
 
 HELD = 20_000_000  #: the same of samples in files, which are held in memory
 
-CLEARLY = 0.1
-"""Share of the squares that fewer orders of a beam must leave at most where the other program may have had all."""
-
 _STORED = (".fits", ".fit", ".gz", ".npy", ".npz", ".h5", ".hdf5", ".nc")  #: what a file of maps is called
 
 
@@ -271,7 +268,7 @@ def _external(own: config.RunConfig, given: str, nthreads: int) -> dict[str, NDA
 def _closer(
     made: dict[str, NDArray[np.float64]], wanted: dict[str, NDArray[np.float64]], run: config.RunConfig, nthreads: int
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the maps of a run as they were made, or those that are closer to the other side's.
+    """Return the maps of a run as they were made, or those that are closer to the other side's, but for a factor.
 
     Orientation moments spread samples over their pixels otherwise than another simulator does, which may have all
     orders of a beam too.
@@ -280,8 +277,8 @@ def _closer(
     if external is not None:
         return made
     full = with_all_orders(run)
-    tried = [[made], []]
-    for one, ways in zip((run, full) if full != run else (run,), tried, strict=False):
+    ways = [made]
+    for one in (run, full) if full != run else (run,):
         if one is full:
             whole = survey(with_known_offsets(full), nthreads)
             ways.append(dict(zip(whole.map_names, simulate.maps(whole, 0, nthreads), strict=True)))
@@ -294,11 +291,12 @@ def _closer(
             there = wanted[name]
             if there.size == maps[name].size:
                 both = (maps[name] > UNSEEN_BELOW) & (there > UNSEEN_BELOW) & np.isfinite(there)
-                total += float(np.sum((maps[name] - there)[both] ** 2))
+                here, there = maps[name][both], there[both]
+                factor = float(here @ there) / max(float(here @ here), 1e-300)
+                total += float(np.sum((factor * here - there) ** 2))
         return total
 
-    own, in_full = (min(ways, key=distance, default=made) for ways in tried)
-    return own if full == run or distance(own) < CLEARLY * distance(in_full) else in_full
+    return min(ways, key=distance)
 
 
 def _by_samples(run: config.RunConfig, nthreads: int) -> dict[str, NDArray[np.float64]] | None:

@@ -207,6 +207,26 @@ def test_a_configuration_that_is_a_side_describes_it_whatever_lies_beside(tmp_pa
     assert mcsim.compare(folder, a).verdict == "identical"
 
 
+@pytest.mark.parametrize("factor", [1.0, 1e-6])
+def test_a_configuration_beside_maps_of_a_run_has_the_orders_of_a_run(tmp_path, factor):
+    """Whatever else is different, which may be far more than the orders that a run leaves out."""
+    head = DESCRIPTION.partition("scan =")[0]
+    for name, psi_deg in (("a", 10.0), ("b", 15.0)):
+        (tmp_path / f"{name}.toml").write_text(
+            head + f'scan = {{ kind = "parallel_transport", psi0_deg = {psi_deg} }}\n'
+        )
+    a, b = (tmp_path / f"{name}.toml" for name in "ab")
+    [folder] = mcsim.write_maps(b, tmp_path / "b", realizations=0)
+    map_ = factor * healpy.read_map(folder / "W1.fits")
+    healpy.write_map(folder / "W1.fits", map_, dtype=np.float64, column_units="uK", overwrite=True)
+    for sides, sign in (((a, folder), 1.0), ((folder, a), -1.0)):
+        found = mcsim.compare(*sides, a if sign > 0.0 else b)
+        assert sorted(names(found)) == (["psi_offset"] if factor == 1.0 else ["psi_offset", "unit"])
+        turned = next(d for d in found.channels[0].differences if d.name == "psi_offset")
+        assert turned.amplitude == pytest.approx(5.0 * sign, rel=1e-3)
+        assert found.channels[0].left < 1e-6
+
+
 @pytest.mark.parametrize("name", ["maps.zarr", "W1.fits", "maps.npz"])
 def test_stored_maps_are_named_in_a_configuration(tmp_path, name):
     if name.endswith(".zarr"):
