@@ -29,10 +29,9 @@ Source = str | Path | Mapping[str, Any] | config.RunConfig | Survey
 
 L_MOMENTS = 64  #: highest degree of the orientation moments in predictions to all orders in the beam
 
-L_WEIGHTS = range(64, 193, 32)
-"""Highest degree of moments times weights: the first that holds :data:`SHARE` of the mean square of the weights."""
-
-SHARE = 0.99
+L_WEIGHTS, SHARE = range(64, 193, 32), 0.99
+"""Highest degrees of moments times weights, of which the first is taken that holds this share of the weights' square.
+"""
 
 _LEFT_OUT = ("sky", "gain", "signal", "excess")  #: hooks of effects that no prediction follows
 
