@@ -454,7 +454,6 @@ def test_unreadable_user_pointing(tmp_path):
 @pytest.mark.parametrize(
     ("name", "period_s", "phases"),
     [("wmap", 129.3, 1), ("wmap", 3620.4, 1), ("planck", 10.0, 6), ("litebird", 600.0, 2)],
-    [("wmap", 129.3, 1), ("wmap", 3620.4, 1), ("planck", 10.0, 6), ("litebird", 600.0, 2)],
 )
 def test_samples_that_miss_phases_of_the_spin_are_told(name: str, period_s: float, phases: int) -> None:
     model = ScanModel.load(name).with_sampling(period_s)

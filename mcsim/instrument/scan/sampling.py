@@ -21,13 +21,13 @@ def warn_of_aliases(model: ScanModel, grid: MapGrid) -> None:
     a pixel.
     """
     pixel = math.sqrt(4.0 * math.pi / grid.npix)
-    through = pixel / (2.0 * math.pi) * min(model.orbit_period_s, model.duration_days * SECONDS_PER_DAY)
+    through = min(pixel / (2.0 * math.pi) * model.orbit_period_s, model.duration_days * SECONDS_PER_DAY)
     spin = abs(model.spin_period_s)
     for line in model.select():
         period = model.period_of_samples(line)
         around = 2.0 * math.pi * math.sin(math.radians(line.boresight_angle_deg)) / pixel
         number = through / period
-        for phases in range(1, max(int(min(FEW, around / APART, number / DENSE)), 1) + 1):
+        for phases in range(1, int(min(FEW, around / APART, max(number / DENSE, 1.0))) + 1):
             turns = phases * period / spin
             if round(turns) > 0 and abs(turns - round(turns)) * number < 1.0:
                 warnings.warn(
