@@ -405,6 +405,8 @@ def _pair(
         paths = tuple(config.channel_path(spec.scan.path, name, split) for split in splits)
         files = PointingFiles(paths, channel.site.frame)
     pair = ChannelPair(name, tuple(maps), a, b, seen, absent, one_sided, scene, channel, hits, not named, files)
+    # Parallel transport is said of pixels' centres: there are no samples that a simulator could have elsewhere.
+    pair = replace(pair, by_moments=isinstance(spec.scan, config.ScanParallelTransport))
     return pair if named else pair.with_sky_of_maps()
 
 

@@ -227,6 +227,15 @@ def test_a_configuration_beside_maps_of_a_run_has_the_orders_of_a_run(tmp_path, 
         assert found.channels[0].left < 1e-6
 
 
+def test_another_spectrum_is_no_cause_where_no_sample_can_be_elsewhere(tmp_path):
+    """Under parallel transport a set must explain as much as where samples are known."""
+    head = DESCRIPTION.partition("scan =")[0].replace("420.0", "300.0").replace("320.0", "240.0")
+    head = head.replace("lmax = 32", "lmax = 40") + 'scan = { kind = "parallel_transport" }\n'
+    for name, text in (("a", head), ("b", head.replace("wmap7", "planck2018"))):
+        (tmp_path / f"{name}.toml").write_text(text)
+    assert mcsim.compare(tmp_path / "a.toml", tmp_path / "b.toml").verdict == "unknown"
+
+
 @pytest.mark.parametrize("name", ["maps.zarr", "W1.fits", "maps.npz"])
 def test_stored_maps_are_named_in_a_configuration(tmp_path, name):
     if name.endswith(".zarr"):

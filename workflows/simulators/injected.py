@@ -30,7 +30,6 @@ from mcsim.simulation.survey import survey
 from mcsim.sphere.healpix import pixel_window
 from mcsim.sphere.rotation import rotate_alm
 
-
 NOISE_UK = 60.0
 """Noise of a sample, where it is shared."""
 
