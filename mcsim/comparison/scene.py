@@ -15,7 +15,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.user_pointing import blocks_of_files
-from mcsim.simulation import convolve, tod
+from mcsim.simulation import convolve, sampled, tod
 from mcsim.simulation.offsets import expansion, offset_maps
 from mcsim.simulation.preparation import Preparation
 from mcsim.simulation.survey import Channel
@@ -28,7 +28,6 @@ from mcsim.systematics.shape import displaced
 Maps = NDArray[np.float64]  #: maps of one channel, uK, shape (split, npix)
 KEPT = 4  #: transforms that are kept: scenes with the same sky and beam differ in their moments alone
 KEPT_BEAMS = 64  #: displaced beams that are kept: one for every time shift that is tried
-EPSILON = 1e-7  #: accuracy of the interpolation of single samples
 WEAKEST = 1e-4  #: share of its largest value below which a beam's window is not divided out
 
 
@@ -245,7 +244,7 @@ class Scene:
         if own and key in self._made:
             return self._made[key][1]
         sky = self.sky_of_samples(window)
-        signal = signal or tod.sky_signal(sky, self.lmax, self.beam, EPSILON, self.nthreads)
+        signal = signal or tod.sky_signal(sky, self.lmax, self.beam, sampled.EPSILON, self.nthreads)
         streams = (self.stream(pointing, split) for split in range(len(self.moments)))
         binned = np.stack([tod.bin_samples(signal(self._pointed(s)), self.nside)[0] for s in streams])
         made = self._prepared(self._with_added(binned))
