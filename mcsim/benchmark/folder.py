@@ -24,7 +24,8 @@ class Settings:
     with out-of-library effects, are made sample by sample, by another route than that which the diagnosis simulates
     with. ``out_of_library`` is a Python file with classes of effects that no library has; None: there are none, or they
     are not known because the challenge was read from its folder. ``simulations`` is the number for the covariance of
-    the data vector; default: ten for each element. ``including`` names effects that are proposed on request alone.
+    the data vector; default: three for each element, shrunk. ``including`` names effects that are proposed on request
+    alone.
     """
 
     model: config.RunConfig

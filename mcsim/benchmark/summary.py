@@ -124,12 +124,13 @@ def _detection(score: Score) -> list[Metric]:
 
 def _naming(records: Sequence[Record]) -> list[Metric]:
     ones = [r for r in records if r.kind == "one" and r.strength >= NAMED]
-    distinct = [r.right for r in ones if r.rival <= DISTINCT]
+    distinct = [r for r in ones if r.rival <= DISTINCT]
     between = [r.right for r in ones if DISTINCT < r.rival <= DEGENERATE]
     degenerate = [r.truth in r.answers for r in ones if r.rival > DEGENERATE]
     single, several = f"right effect, S/N >= {NAMED:g}", f"truth in the set, S/N >= {NAMED:g}"
     return [
-        share(f"{single}, |rho| <= {DISTINCT:g}", distinct).within("at least 95 %", 0.95),
+        share(f"{single}, |rho| <= {DISTINCT:g}", [r.right for r in distinct]).within("at least 95 %", 0.95),
+        share(f"{single}, |rho| <= {DISTINCT:g}, Bayes", [r.bayes == r.truth for r in distinct]),
         share(f"{single}, {DISTINCT:g} < |rho| <= {DEGENERATE:g}", between),
         share(f"{several}, |rho| > {DEGENERATE:g}", degenerate).within("at least 95 %", 0.95),
         share("truth in the set, two effects", [r.truth in r.answers for r in records if r.kind == "two"]),

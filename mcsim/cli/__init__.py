@@ -299,6 +299,8 @@ app.add_typer(challenge, name="challenge")
 
 Folder = Annotated[Path, Argument(metavar="DIR", help="Folder of the challenge.")]
 Target = Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder to fill.")]
+Weakest = Annotated[float, Option(help="Smallest expected S/N of an effect.")]
+Strongest = Annotated[float, Option(help="Largest expected S/N of an effect.")]
 
 
 @challenge.command("make", cls=Command)
@@ -308,8 +310,8 @@ def challenge_make(
     cases: Annotated[int, Option(min=1, help="Number of cases.")] = 200,
     seed: Annotated[int, Option(min=0, help="Of the draws; keep it as secret as the keys.")] = 0,
     sampled_share: Annotated[float, Option(min=0.0, max=1.0, help="Share of maps made sample by sample.")] = 0.5,
-    weakest: Annotated[float, Option(help="Smallest expected S/N of an effect.")] = 3.0,
-    strongest: Annotated[float, Option(help="Largest expected S/N of an effect.")] = 20.0,
+    weakest: Weakest = 3.0,
+    strongest: Strongest = 20.0,
     inventions: Annotated[Path | None, Option(metavar="FILE", help="Python file of effects in no library.")] = None,
     including: Including = None,
     simulations: Simulations = None,
@@ -356,6 +358,8 @@ def challenge_draws(
     output: Target,
     number: Annotated[int, Option(min=1, help="Number of draws.")] = 1000,
     seed: Annotated[int, Option(min=0, help="Of the draws.")] = 0,
+    weakest: Weakest = 3.0,
+    strongest: Strongest = 20.0,
     including: Including = None,
     simulations: Simulations = None,
     workers: Workers = None,
@@ -364,9 +368,15 @@ def challenge_draws(
     """Draw and score compressed data vectors, without maps."""
     from mcsim import config
     from mcsim.benchmark import report, score
+    from mcsim.benchmark.case import Prior
     from mcsim.benchmark.folder import Settings
 
-    shared = Settings(config.load(model), simulations=simulations, including=tuple(including or ()))
+    shared = Settings(
+        config.load(model),
+        Prior(weakest=weakest, strongest=strongest),
+        simulations=simulations,
+        including=tuple(including or ()),
+    )
     found = score.score_draws(shared, output, number, seed, workers=chosen(workers, scheduler), quiet=False)
     print("\n".join(report.lines(found)))
 

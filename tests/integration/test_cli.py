@@ -482,6 +482,7 @@ def test_config_refuses_scans_that_run_refuses(scan: str, key: str, mcsim: Comma
         (("make", "quickstart", "-o", "made", "--inventions", "nowhere.py"), "nowhere.py"),
         (("make", "nowhere.toml", "-o", "made"), "nowhere.toml"),
         (("draws", "quickstart", "-o", "made", "--number", "0"), "--number"),
+        (("draws", "quickstart", "-o", "made", "--weakest", "30"), "from 30 to 20"),
         (("run", "nowhere"), "nowhere"),
         (("score", "nowhere"), "nowhere"),
     ],

@@ -472,6 +472,7 @@ def test_what_counts_as_right():
     assert [one.wrong_name for one in records] == [False, True, False, False, True, False]
     figures = {figure.name: figure for figure in Score("toy", records).metrics}
     assert figures["right effect, S/N >= 5, |rho| <= 0.7"].value == 0.5
+    assert figures["right effect, S/N >= 5, |rho| <= 0.7, Bayes"].value == 1.0
     assert figures["truth in the set, S/N >= 5, |rho| > 0.9"].value == 1.0
     assert figures["unknown, S/N >= 8 beyond every triple"].value == 0.5
     assert figures["right answers, Bayes less diagnosis"].value == pytest.approx(1 / 3)
