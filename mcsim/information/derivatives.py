@@ -11,6 +11,7 @@ from mcsim import systematics
 from mcsim.datavector.analysis import Analysis
 from mcsim.datavector.campaign import with_effects
 from mcsim.datavector.candidate import Candidate
+from mcsim.instrument.beams import Beam
 from mcsim.simulation import convolve, simulate
 from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
@@ -19,6 +20,7 @@ from mcsim.support.arrays import Alm, Vector, divided
 from mcsim.systematics import Effect
 
 Maps = NDArray[np.float64]
+Orders = NDArray[np.complex128]  #: of a beam, shape (mmax + 1, lmax + 1)
 Observe = Callable[[Alm], Maps]  #: return the maps of all channels, shape (map, npix), of a sky
 DRAWS = 64  #: realizations that the mean of an effect of random shape is estimated from, in two halves
 STEP = 0.1  #: share of an effect's ``step``: an ellipticity of either sign bends the response by half of itself
@@ -168,15 +170,21 @@ def _quiet(shared: Survey) -> Survey:
 
 
 def _difference(plus: Channel, minus: Channel, width: float) -> Channel:
-    """Return a channel whose response is the derivative of that of two, which differ in nothing else."""
-    a, b = plus.response.factors, minus.response.factors
+    """Return a channel that sees the sky through the derivative of the beams of two, which differ in nothing else."""
+    beam = Beam(_slope(plus.beam.blm, minus.beam.blm, width))
+    response = convolve.Response(_slope(plus.response.factors, minus.response.factors, width))
+    wide = plus if plus.response.mmax >= minus.response.mmax else minus
+    return replace(wide, beam=beam, response=response, effects=())
+
+
+def _slope(a: Orders, b: Orders, width: float) -> Orders:
+    """Return (a - b) / width of the orders of two beams, without orders that are rounding alone."""
     change = np.zeros((max(len(a), len(b)), a.shape[1]), dtype=np.complex128)
     change[: len(a)] += a
     change[: len(b)] -= b
     size = np.abs(change).max(axis=1)
     change[size < NEGLIGIBLE * np.abs(a).max()] = 0.0
-    wide = plus if len(a) >= len(b) else minus
-    return replace(wide, response=convolve.Response(change / width), effects=())
+    return change / width
 
 
 def _noise_change(plus: Survey, minus: Survey, width: float) -> Maps | None:

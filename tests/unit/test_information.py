@@ -144,6 +144,23 @@ def test_an_effect_of_a_file_has_a_limit_and_one_that_cannot_act_has_none() -> N
         )
 
 
+@pytest.mark.parametrize("name", ["beam_width", "pointing_offset"])
+def test_a_beam_changes_what_samples_off_their_pixel_centres_see(name: str) -> None:
+    """F = 1/2 Tr[C^-1 dC C^-1 dC] + dmu' C^-1 dmu, from whole covariances of the simulator with those samples."""
+    run = model()
+    run = replace(run, map=replace(run.map, offset_order=2))
+    found = mcsim.limit(run, settings=mcsim.LimitSettings(only=(name,), dense=True, orders=2))
+    pixels = np.flatnonzero(np.concatenate([m.weight > 0 for c in survey(run).channels for m in c.maps]))
+    step = 0.1 * systematics.get(name).step
+    ends = [moments_of(with_effects(run, [effect(name, "V1", sign * step)])) for sign in (1.0, -1.0)]
+    mean, covariance = ((a - b) / (2.0 * step) for a, b in zip(*ends, strict=True))
+    factor = cho_factor(moments_of(run)[1][np.ix_(pixels, pixels)], lower=True)
+    filtered = cho_solve(factor, covariance[np.ix_(pixels, pixels)])
+    expected = 0.5 * np.sum(filtered * filtered.T) + mean[pixels] @ cho_solve(factor, mean[pixels])
+    # The inverse covariance has samples at the centres of their pixels.
+    assert found.fisher[0, 0] == pytest.approx(expected, rel=2e-3)
+
+
 @pytest.mark.slow
 def test_dense_matrix_is_the_curvature_of_the_likelihood() -> None:
     """F_ij = - d^2 <ln L> / d theta_i d theta_j, by finite differences of whole covariances and means."""
