@@ -19,8 +19,9 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,7 @@ from mcsim.support.code import package_digest
 
 LOWEST = 2  #: lowest degree in bins: the monopole and the dipole of a map are not those of its sky
 PAIRS = 20  #: pairs of random probes for each number whose Fisher matrix they estimate
+LEAST_PAIRS = 10  #: the same of probes that are asked for: half of the probes has a quarter, which must have an inverse
 TOLERANCE = 1e-6  #: relative residual at which the inverse covariance of a map is found
 
 DIPOLE_UK = 100.0
@@ -194,12 +196,43 @@ def probes_of(bands: Sequence[Bands], asked: int | None) -> int:
     largest = max(each.size for each in bands)
     if asked is None:
         return int(np.ceil(np.sqrt(2.0 * PAIRS * largest))) + 1
-    if asked * (asked - 1) < 4 * largest:
+    if asked * (asked - 1) < 2 * LEAST_PAIRS * largest:
         raise InputError(
             f"biposh.probes = {asked} make {asked * (asked - 1) // 2} pairs, too few to normalise {largest} numbers; "
-            f"raise it to {int(np.sqrt(4.0 * largest)) + 2} or more, or leave it out."
+            f"raise it to {int(np.sqrt(2.0 * LEAST_PAIRS * largest)) + 2} or more, or leave it out."
         )
     return asked
+
+
+class Response(NamedTuple):
+    """Fisher matrix of the numbers of a pair of maps, and the factor that makes its inverse unbiased on average."""
+
+    matrix: Matrix
+    unbiased: float = 1.0
+
+
+def _unbiased(halves: Sequence[tuple[Matrix, float]], pairs: float) -> float:
+    """Return the factor of an inverse from so many pairs of random probes.
+
+    ``halves``: sums over the pairs of two independent halves of the probes, and their numbers.
+
+    Notes
+    -----
+    For independent pairs it is that of Hartlap, Simon & Schneider (2007, A&A 464, 399, eq. 17). But a probe is in many
+    of them, which adds a bias in inverse proportion to the number of probes: tr(F_1^-1 F_2) of the halves, whose mean
+    is one without a bias, has twice that of the whole.
+    """
+    size = len(halves[0][0])
+
+    def independent(count: float) -> float:
+        return (count - size - 1.0) / count
+
+    (one, first), (two, second) = ((total / count, count) for total, count in halves)
+    traces = [
+        independent(count) * float(np.trace(np.linalg.solve(a, b))) / size
+        for a, b, count in ((one, two, first), (two, one, second))
+    ]
+    return independent(pairs) / (1.0 + 0.5 * (float(np.mean(traces)) - 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,26 +260,23 @@ class Filtering:
         """Return the number of probes of every map; InputError if ``probes`` are too few."""
         return 0 if self.uniform else probes_of(self.bands, self.probes)
 
-    def fisher(self, progress: Progress | None = None) -> tuple[Matrix, ...]:
+    def fisher(self, progress: Progress | None = None) -> tuple[Response, ...]:
         """Return F of every pair, estimated once and kept in the cache; exact if no map needs random probes."""
         if not self.drawn:
-            return tuple(self._exact(number) for number in range(len(self.pairs)))
+            return tuple(Response(self._exact(number)) for number in range(len(self.pairs)))
 
         def fill(folder: Path) -> None:
-            np.savez(folder / "fisher.npz", *self._estimated(progress))
+            matrices, factors = zip(*self._estimated(progress), strict=True)
+            np.savez(folder / "fisher.npz", *matrices, factors=factors)
 
         with np.load(folders.cached(f"filter-{self._key()}", fill) / "fisher.npz") as stored:
-            return tuple(stored[name] for name in stored.files)
+            each = enumerate(stored["factors"].tolist())
+            return tuple(Response(stored[f"arr_{number}"], factor) for number, factor in each)
 
     @cached_property
     def inverses(self) -> tuple[Matrix, ...]:
-        """Return F^-1 of every pair, unbiased (Hartlap, Simon & Schneider 2007, A&A 464, 399, eq. 17)."""
-        found = []
-        for bands, matrix, (x, y) in zip(self.bands, self.fisher(), self.pairs, strict=True):
-            pairs = self.drawn * (self.drawn - 1) // (2 if x == y else 1)
-            unbiased = (pairs - bands.size - 1) / pairs if pairs else 1.0
-            found.append(np.asarray(unbiased * np.linalg.inv(matrix)))
-        return tuple(found)
+        """Return F^-1 of every pair, its mean over random probes on the diagonal."""
+        return tuple(np.asarray(each.unbiased * np.linalg.inv(each.matrix)) for each in self.fisher())
 
     @cached_property
     def per_ell(self) -> NDArray[np.float64]:
@@ -258,7 +288,7 @@ class Filtering:
         found = np.stack([bands.products(*self._totals(pair)) for bands, pair in self._pairs()])
         if self.uniform:
             return found
-        for factor, (bands, pair), matrix in zip(found, self._pairs(), self.fisher(), strict=True):
+        for factor, (bands, pair), (matrix, _) in zip(found, self._pairs(), self.fisher(), strict=True):
             full = bands.uniform(bands.products(*self._totals(pair)))
             mode, place, _ = bands.numbers
             middle = bands.first + (np.append(bands.first[1:], bands.lmax + 1) - 1 - bands.first) / 2.0
@@ -309,35 +339,42 @@ class Filtering:
 
     def response(
         self, probes: Sequence[tuple[Alm, ...]], number: int, given: Callable[[Alm, Alm], float] | None = None
-    ) -> Matrix:
+    ) -> Response:
         """Return F of a pair of maps from the filtered coefficients of random probes.
 
         ``given``: a linear function x' dC y of two of them, of any other change dC of the covariance: as a last row
         and column what the numbers know of it.
         """
         (x, y), bands = self.pairs[number], self.bands[number]
+        half = len(probes) // 2
 
-        def of(i: int) -> Matrix:
-            rows = []
-            for j in range(i + 1 if x == y else 0, len(probes)):
-                if i == j:
-                    continue
+        def of(i: int) -> NDArray[np.float64]:
+            """Return the sums of a probe with others of the first half, of the second, and of different halves."""
+            others = [j for j in range(i + 1 if x == y else 0, len(probes)) if j != i]
+            rows = np.empty((len(others), bands.size + (given is not None)))
+            for row, j in zip(rows, others, strict=True):
                 first, second = probes[i][x], probes[j][y]
                 raw = estimate(self.tables, first, second)
                 if x == y:
                     raw = 0.5 * (raw + estimate(self.tables, second, first))
-                row = bands.sums(raw)
+                row[: bands.size] = bands.sums(raw)
                 if given is not None:
-                    row = np.append(row, given(first, second) * (0.5 if x == y else 1.0))
-                rows.append(row)
-            values = np.reshape(rows, (len(rows), -1))
-            return np.asarray(values.T @ values)
+                    row[-1] = given(first, second) * (0.5 if x == y else 1.0)
+            own = np.array([int(i >= half) if (i < half) == (j < half) else 2 for j in others])
+            return np.stack([rows[own == which].T @ rows[own == which] for which in range(3)])
 
-        pairs = len(probes) * (len(probes) - 1) / (2.0 if x == y else 1.0)
         members = range(len(probes) - 1 if x == y else len(probes))
         with ThreadPoolExecutor(self.filters[0].inverse.nthreads) as pool:
-            total = sum(pool.map(of, members))
-        return np.asarray(total * ((2.0 if x == y else 1.0) / pairs))
+            first, second, across = reduce(np.add, pool.map(of, members))
+        ordered = 2.0 if x == y else 1.0
+
+        def pairs(count: int) -> float:
+            return count * (count - 1) / ordered
+
+        halves = [(first, pairs(half)), (second, pairs(len(probes) - half))]
+        total = (first + second + across) / pairs(len(probes))
+        unbiased = _unbiased(halves, pairs(len(probes)))
+        return Response(np.asarray(ordered * total), unbiased)
 
     def probed(self, progress: Progress | None = None) -> list[tuple[Alm, ...]]:
         """Return the filtered coefficients of all maps for every random probe."""
@@ -358,7 +395,7 @@ class Filtering:
         bands, pair = self.bands[number], self.pairs[number]
         return np.diag(bands.uniform(bands.products(*self._totals(pair))))
 
-    def _estimated(self, progress: Progress | None) -> list[Matrix]:
+    def _estimated(self, progress: Progress | None) -> list[Response]:
         probes = self.probed(progress)
         return [self.response(probes, number) for number in range(len(self.pairs))]
 

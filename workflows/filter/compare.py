@@ -49,7 +49,7 @@ def expected(shared: Survey, number: int, few: Filtering, probes: list) -> tuple
         both = 0.5 * (estimate(tables, first, second) + estimate(tables, second, first))
         return float(2.0 * np.sum(bands.count * (added.conj() * np.nan_to_num(both)).real))
 
-    joint = few.response(probes, number, change)
+    joint = few.response(probes, number, change).matrix
     fisher, mixed = joint[:-1, :-1], joint[:-1, -1]
     mean = np.linalg.solve(fisher, mixed)
     # What of the change is no sum of the bins adds scatter to the regression on them.
