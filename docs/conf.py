@@ -88,10 +88,11 @@ def _readme(docname: str, name: str) -> str:
     pages = {str(path): page for page, path in _shown()}
 
     def link(match: re.Match[str]) -> str:
-        target = os.path.normpath(folder / match[1])
+        path, _, section = match[1].partition("#")
+        target = os.path.normpath(folder / path)
         if target in pages:
-            return f"](/{pages[target]}.md)"
-        return f"]({os.path.relpath(target, (HERE / docname).parent)})"
+            return f"](/{pages[target]}.md{'#' + section if section else ''})"
+        return f"]({os.path.relpath(target, (HERE / docname).parent)}{'#' + section if section else ''})"
 
     return re.sub(r"\]\(((?!https?:|#)[^)]+)\)", link, (folder / "README.md").read_text())
 
