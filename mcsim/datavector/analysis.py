@@ -171,7 +171,7 @@ def _candidates(model: Model, kinds: Sequence[tuple[str, type[Effect]]]) -> Iter
         fit = effect.parametrization if name in declared else effect.parametrization.seen_at(frequencies)
         for channel in (None,) if effect.scope == "common" else model.channels:
             for fixed in effect.variants:
-                if _applies(model, effect, channel, fixed):
+                if _hindrance(model, effect, channel, fixed) is None:
                     columns = tuple(range(len(fit.basis())))
                     yield Candidate(effect, channel, columns, dict(fixed), step=_step(model, effect, channel), fit=fit)
 
@@ -181,32 +181,46 @@ def kinds_of(library: Library | None) -> Kinds:
     return tuple((systematics.catalogue() if library is None else library).items())
 
 
-def _applies(model: Model, kind: type[Effect], channel: str | None, settings: Mapping[str, Any]) -> bool:
-    """Return True if an effect can be there: what it depends on is known, and it changes something.
+def _hindrance(model: Model, kind: type[Effect], channel: str | None, settings: Mapping[str, Any]) -> str | None:
+    """Return why an effect cannot be there, or would change nothing; None if it can be there.
 
-    Left out are effects on noise if there is none, on orientations that are a scan's already or that a circular beam
-    does not show, on differencing in other scans, and on the samples of one beam in differencing scans.
+    HookError for one whose hooks fail.
     """
     owners = [c for c in model.survey.channels if channel in (None, c.name)]
     if kind.differencing is not Effect.differencing and any(owner.side_b is None for owner in owners):
-        return False
+        return "it acts on differencing, and the scan has none"
     if kind.excess is not Effect.excess and any(owner.side_b is not None for owner in owners):
-        return False
+        return "it disturbs the samples of one beam, and the scan takes differences of two"
     if kind.orientations is not Effect.orientations:
         scans = [spec.scan for spec in model.survey.config.channels if channel in (None, spec.name)]
         if not all(isinstance(scan, config.ScanParallelTransport) for scan in scans):
-            return False
+            return "it acts on the orientations of parallel transport, and the scan has its own"
         if not any(owner.beam.mmax for owner in owners):
-            return False
+            return "it acts on orientations, which a circular beam does not show"
     effect = systematics.basis_of(kind, settings)[0]
     try:
         for owner in owners:
             systematics.tried((effect,), replace(owner.site, lmax=model.lmax))
             effect.orientations(owner.maps[0].moments, owner.site)
-    except InputError:
-        return False
+    except systematics.HookError:
+        raise
+    except InputError as error:
+        return str(error).rstrip(".")
     quiet = all(m.noise_uk is None for owner in owners for m in owner.maps)
-    return not (quiet and (kind.noise is not Effect.noise or kind.excess is not Effect.excess))
+    if quiet and (kind.noise is not Effect.noise or kind.excess is not Effect.excess):
+        return "it acts on noise, and the maps have none"
+    return None
+
+
+def check_asked(analysis: Analysis, names: Sequence[str]) -> None:
+    """Raise InputError for an effect that is asked for and is no candidate, with the reason."""
+    missing = sorted(set(names) - {candidate.name for candidate in analysis.candidates})
+    for name in missing:
+        kind = dict(analysis.library)[name]
+        places = (None,) if kind.scope == "common" else analysis.model.channels
+        reasons = [_hindrance(analysis.model, kind, place, dict(fixed)) for place in places for fixed in kind.variants]
+        why = next((reason for reason in reasons if reason is not None), "what is measured does not show it")
+        raise InputError(f"effect {name} is asked for, but cannot be found in this model: {why}; leave it out.")
 
 
 def _step(model: Model, kind: type[Effect], channel: str | None) -> float | None:

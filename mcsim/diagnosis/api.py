@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mcsim import config, systematics
 from mcsim.datavector import campaign, cost, null_ensemble, spectra_table
-from mcsim.datavector.analysis import Analysis, Job, analysis_of, data_vectors
+from mcsim.datavector.analysis import Analysis, Job, analysis_of, check_asked, data_vectors
 from mcsim.datavector.campaign import asking, batch
 from mcsim.datavector.candidate import TemplateBank
 from mcsim.datavector.kept import Kept
@@ -99,13 +99,14 @@ def diagnose(
     quiet, workers = _computing(**computing)
     run, source = loaded(model)
     settings = settings_of(settings, DiagnosisSettings)
-    wanted, (settings, library) = settings.controls, _with_library(settings)
+    wanted, (settings, library, asked) = settings.controls, _with_library(settings)
     if output is not None:
         output = folders.user_path(output)
         folders.writable(output)
     processes = run.compute.workers if workers is None else workers
     load_ahead(processes)
     run, analysis, table = _analysed(run, source, data, settings, library, wanted)
+    check_asked(analysis, asked)
     task: Callable[[Job], NDArray[np.float64]] = data_vectors if table is None else table
     maps: Sequence[NDArray[np.float64]] = ()
     means = False
@@ -145,8 +146,8 @@ def diagnose(
     return diagnosis
 
 
-def _with_library(settings: DiagnosisSettings) -> tuple[DiagnosisSettings, systematics.Library]:
-    """Return settings that name effects of a library, and that library; refuse other names."""
+def _with_library(settings: DiagnosisSettings) -> tuple[DiagnosisSettings, systematics.Library, tuple[str, ...]]:
+    """Return settings that name effects of a library, that library, and what is asked for; refuse other names."""
     known = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
     asked = tuple(settings.including) if settings.library is None else (*settings.including, *known)
     kinds = {name: systematics.get(name, known) for name in (*settings.without, *asked)}
@@ -154,7 +155,12 @@ def _with_library(settings: DiagnosisSettings) -> tuple[DiagnosisSettings, syste
         raise InputError(f"{min(both)} is asked for and left out (--with and --without); choose one of them.")
     known = {**known, **{kinds[name].name: kinds[name] for name in asked}}
     including = tuple(sorted({kinds[name].name for name in asked if not kinds[name].proposed}))
-    return replace(settings, without=tuple(settings.without), including=including, library=None, controls=0), known
+    named = tuple(kinds[name].name for name in settings.including)
+    return (
+        replace(settings, without=tuple(settings.without), including=including, library=None, controls=0),
+        known,
+        named,
+    )
 
 
 def describe(
@@ -167,8 +173,9 @@ def describe(
     Data that are named are read, and refused as :func:`diagnose` refuses them.
     """
     run, source = loaded(model)
-    count, (settings, library) = settings.controls, _with_library(settings)
+    count, (settings, library, asked) = settings.controls, _with_library(settings)
     run, analysis, table = _analysed(run, source, data, settings, library, count)
+    check_asked(analysis, asked)
     if data is not None and table is None:
         read_maps(analysis.model, data)
     planned, size = campaign.plan(analysis, settings.simulations), len(analysis.elements)

@@ -17,6 +17,7 @@ from mcsim.systematics.base import (
     tried,
     variance_factor,
 )
+from mcsim.systematics.hooks import HookError
 from mcsim.systematics.parametrization import Parametrization
 from mcsim.systematics.registry import Library, basis_of, build, catalogue, checked, effects, get, in_file
 
@@ -25,6 +26,7 @@ __all__ = [
     "Bound",
     "Draw",
     "Effect",
+    "HookError",
     "Library",
     "Map",
     "Parametrization",

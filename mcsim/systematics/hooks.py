@@ -19,6 +19,10 @@ _OF_THE_SHAPE_OF = {"sky": "the sky", "gain": "the times", "signal": "the times"
 _NUMBERS = {*_OF_THE_SHAPE_OF, "noise", "spread"}
 
 
+class HookError(InputError):
+    """A hook of an effect that fails, or returns what is no number: never a reason to leave the effect out."""
+
+
 def guard(kind: type) -> None:
     """Let the hooks that a class defines say in a sentence if they fail, or return what is no number."""
     for hook in HOOKS:
@@ -37,11 +41,11 @@ def _guarded(hook: str, function: Callable[..., Any]) -> Callable[..., Any]:
         except InputError:
             raise
         except Exception as error:  # whatever a user's code does
-            raise InputError(f"{what} fails ({type(error).__name__}: {error}); mend it.") from error
+            raise HookError(f"{what} fails ({type(error).__name__}: {error}); mend it.") from error
         if not finite:
-            raise InputError(f"{what} returns values that are not finite; let it return numbers.")
+            raise HookError(f"{what} returns values that are not finite; let it return numbers.")
         if hook in _OF_THE_SHAPE_OF and found is not None and given and values.shape != np.shape(given[0]):
-            raise InputError(
+            raise HookError(
                 f"{what} returns an array of shape {values.shape} where {_OF_THE_SHAPE_OF[hook]} have "
                 f"{np.shape(given[0])}; let it return one value for each."
             )

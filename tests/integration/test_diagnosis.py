@@ -377,6 +377,27 @@ def test_the_cost_of_a_diagnosis_counts_the_effects_on_request(small):
         api.describe(small.run, replace(least, including=("gain_spin",), without=("gain_spin",)))
 
 
+def test_an_effect_that_is_asked_for_is_not_left_out_in_silence(small, tmp_path):
+    """Neither one whose hook fails, nor one that cannot act in this model."""
+    broken = tmp_path / "broken.py"
+    broken.write_text(
+        "import numpy as np\n"
+        "from dataclasses import dataclass\n"
+        "from mcsim.systematics import Effect\n"
+        "@dataclass(frozen=True, kw_only=True)\n"
+        "class Broken(Effect):\n"
+        "    'A gain that is no number.'\n"
+        "    name, scope, unit, step = 'broken', 'channel', 'fraction', 1e-3\n"
+        "    cause, signature, source = 'None.', 'None.', 'None'\n"
+        "    def gain(self, time_s, site):\n"
+        "        return np.nan * time_s\n"
+    )
+    with refused("broken", "gain", "finite"):
+        api.describe(small.run, DiagnosisSettings(including=(str(broken),)))
+    with refused("mapmaking_convergence", "differencing"):
+        api.describe(small.run, DiagnosisSettings(including=("mapmaking_convergence",)))
+
+
 def test_a_diagnosis_knows_the_library_that_it_is_given(tmp_path, monkeypatch):
     """And names an effect that is in no catalogue; ``without`` is read in that library too."""
     monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))  # in this process
