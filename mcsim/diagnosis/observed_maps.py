@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 
+import healpy
 import numpy as np
 
 from mcsim import config
@@ -101,13 +102,19 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return t
 
     def exchanged(self, found: Attribution) -> list[str]:
-        """Return orders of the maps in which the model fits, unless it fits as they are or one effect explains it."""
+        """Return orders of maps or pixels in which the model fits, unless it fits as they are or one effect does."""
         context, level = self.context, self.context.settings.exchanged_pvalue
         if found.gap.omnibus > level or (found.explanations and len(found.explanations[0].members) == 1):
             return []
         parts, notes = context.analysis.model.parts, []
+
+        def pvalue(maps: Sequence[Map]) -> float:
+            return context.null.pvalue(context.analysis.data_vector(maps))
+
+        if (p := pvalue([healpy.reorder(one, n2r=True) for one in self.data])) > level:
+            notes.append(f"The model fits (p = {p:.2g}) with maps read in the order NESTED; say so in their headers.")
         for order in exchanges(parts):
-            p = context.null.pvalue(context.analysis.data_vector([self.data[i] for i in order]))
+            p = pvalue([self.data[i] for i in order])
             if p > level:
                 moved = [f"{parts[i].name} as {part.name}" for part, i in zip(parts, order, strict=True)]
                 pairs = ", ".join(words for k, words in enumerate(moved) if order[k] != k)

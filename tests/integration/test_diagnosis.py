@@ -449,7 +449,20 @@ def test_maps_by_the_default_route_have_the_mean_of_the_simulations(small):
     np.testing.assert_allclose(moved.of_pixel_means.ensemble.extended.gaussian.mean, known, rtol=1e-12)
 
 
-def test_exchanged_channels_are_noticed(small):
+def test_maps_of_another_order_are_noticed(small):
+    """Of pixels, where a file does not say that it is NESTED, and of splits."""
+    maps = list(simulate.maps(data_of(small.run), 0))
+    gap = SimpleNamespace(gap=SimpleNamespace(omnibus=0.0), explanations=())
+
+    def notes(observed):
+        return " ".join(ObservedMaps(small, observed, ask).exchanged(gap))
+
+    assert "NESTED" in notes([healpy.reorder(one, r2n=True) for one in maps])
+    assert "V1:half1 as V1:half2" in notes([maps[i] for i in (1, 0, 3, 2)])
+    assert "NESTED" not in notes(maps)
+
+
+def test_a_beam_that_no_effect_changes_has_no_single_name(small):
     run = replace(
         small.run,
         channels=(small.run.channels[0], replace(small.run.channels[1], beam=config.BeamGaussian(fwhm_arcmin=500.0))),
