@@ -190,16 +190,26 @@ def spectrum(survey: Survey) -> NDArray[np.float64]:
 
 
 def noise_mean(survey: Survey, number: int, modes: Sequence[Indices]) -> NDArray[np.complex128]:
-    """Return the mean BipoSH of the noise of a map, uK^2, shape (mode, lmax + 1)."""
-    m = _weighted(survey, survey.maps[number])
+    """Return the mean BipoSH of the noise of a map, uK^2, shape (mode, lmax + 1).
+
+    Of a filtered map without the mean field, of which it is a part: for L = 0 alone.
+    """
+    m = survey.maps[number]
     L_max, lmax = max(L for L, _, _ in modes), survey.lmax
     if m.drawn is not None:
         raise InputError(
             f"the noise of map {m.name} is not white, and predictions are of white noise; simulate it with mcsim run, "
             'or give the channel noise of kind "white", "depth" or "variance".'
         )
+    found = np.zeros((len(modes), lmax + 1), dtype=np.complex128)
     if m.noise_uk is None:
-        return np.zeros((len(modes), lmax + 1), dtype=np.complex128)
+        return found
     power = m.noise_uk**2 * nside2pixarea(m.moments.nside)
-    variance = map_harmonics(power if m.weight is None else power * m.weight**2, L_max)
+    if survey.filtering is not None:
+        ell, isotropic = np.arange(lmax + 1), [L == 0 for L, _, _ in modes]
+        cl = survey.filtering.filters[number].noise(power)[: lmax + 1]
+        found[isotropic] = (-1.0) ** ell * np.sqrt(2.0 * ell + 1.0) * cl
+        return found
+    weight = m.weight
+    variance = map_harmonics(power if weight is None else power * weight**2, L_max)
     return without_windows(survey, noise_biposh(modes, variance, lmax), modes, (number, number))

@@ -78,7 +78,8 @@ def predict(
     degrees in between, so it cancels only in part. Noise of variance v(n) per pixel adds v_LM times the pixel area to
     the autos. Weights W(n) (masks, unobserved pixels) replace w_0 = 1 by W and w_s by W w_s in the sum over L1 and L2,
     divided by <W_x W_y>: the BipoSH that they give an isotropic sky are those of the circular-beam control. What they
-    have beyond ``L_moments`` is left out; the attribute ``mask`` says how much that is.
+    have beyond ``L_moments`` is left out; the attribute ``mask`` says how much that is. Filtered maps have the means of
+    the full sky without the mean field, and the noise of the pixels as the filter weights them.
     Variances are C_l1 C_l2 (1 + delta_l1l2) / f_sky, f_sky = <W_x W_y>^2 / <W_x^2 W_y^2>: right for L = 0 and wide
     bins; behind masks those of single l and L > 0 were 1.2 to 1.8 times too large, as standard deviations, in tests.
     Ensembles agree within their errors: tests/integration/test_prediction.py, and test_prediction_pairs.py for pairs,

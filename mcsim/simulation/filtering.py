@@ -39,6 +39,7 @@ from mcsim.support.code import package_digest
 LOWEST = 2  #: lowest degree in bins: the monopole and the dipole of a map are not those of its sky
 PAIRS = 20  #: pairs of random probes for each number whose Fisher matrix they estimate
 LEAST_PAIRS = 10  #: the same of probes that are asked for: half of the probes has a quarter, which must have an inverse
+LEVELS = 1024  #: of the noise that predictions tell apart
 TOLERANCE = 1e-6  #: relative residual at which the inverse covariance of a map is found
 
 DIPOLE_UK = 100.0
@@ -73,6 +74,21 @@ class MapFilter:
     def uniform(self) -> bool:
         """Return True if all pixels have the same noise: the filter is then diagonal."""
         return bool(np.all(self._precision == self._precision[0]))
+
+    def noise(self, power: Map) -> Vector:
+        """Return the mean C_l of noise in what the filter measures, uK^2, shape (lmax of the sky + 1,).
+
+        ``power`` is its variance times the pixel area, uK^2 sr, shape (npix,). Noise that changes slowly over the
+        wavelength of a degree counts as the filter weights the pixels there, by w^2 with w = 1 / C_l of sky and noise.
+        """
+        seen = self._precision > 0.0
+        order = np.argsort(self._precision[seen])
+        parts = np.array_split(order, min(order.size, LEVELS))
+        precision, mean = (np.array([one[seen][part].mean() for part in parts]) for one in (self._precision, power))
+        square = self.window[: self.inverse.lmax + 1, None] ** 2
+        expected = 4.0 * np.pi / self.inverse.npix / precision / square
+        weight = ((self.inverse.cl * self._beam**2)[:, None] + expected) ** -2.0 * [part.size for part in parts]
+        return np.asarray((weight * mean / square).sum(axis=1) / weight.sum(axis=1))
 
     def apply(self, map_uk: Map, near: Alm | None = None) -> tuple[Alm, Alm]:
         """Return the filtered coefficients, uK^-1, and the Wiener-filtered sky, uK, near which the next ones may be."""

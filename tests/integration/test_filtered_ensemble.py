@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from distributed import Client
 
 from mcsim import config, merge, open_ensemble, open_summary, predict, run
@@ -79,6 +80,26 @@ def test_mean_without_mean_field_is_the_prediction_of_the_full_sky(table, store:
         error = found.biposh_qml_difference_standard_error.sel(**one).values[:, bins]
         wanted = expected.biposh_qml_difference_mean.sel(**one).values.real[:, bins]
         assert np.all(abs(mean - wanted) < 4.5 * error + 0.1 * abs(wanted))
+
+
+def test_a_prediction_does_not_know_the_noise_of_hidden_pixels(table) -> None:
+    """Nor that of pixels without samples, which have none."""
+
+    def expected(maps: dict, level: np.ndarray):
+        noise = {"kind": "variance", "variance": level}
+        channel = table["channel"][0] | {"noise": noise}
+        return predict(table | {"map": maps, "channel": [channel]}, snr=True)
+
+    pixel = np.arange(12 * 16**2)
+    seen = abs(pixel - 1500) > 400
+    level = xr.DataArray(np.full(pixel.size, 1e4), dims="pixel", attrs={"units": "uK^2"})
+    full, masked = expected({"nside": 16}, level), expected(table["map"], level)
+    hidden = expected(table["map"], level.where(seen, 1e8))
+    unhit = expected({"nside": 16}, level.where(seen, np.nan))
+    for name in ("cl_mean", "biposh_mean", "biposh_standard_deviation", "signal_to_noise"):
+        xr.testing.assert_allclose(hidden[name], masked[name], rtol=1e-10)
+        xr.testing.assert_allclose(unhit[name], masked[name], rtol=1e-10)
+    xr.testing.assert_allclose(full.cl_mean, masked.cl_mean, rtol=1e-10)
 
 
 def test_dry_run_counts_the_passes_over_samples_once(table, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,6 +86,30 @@ def test_filter_equals_a_dense_solve(filters) -> None:
     assert np.abs(packed(again) - expected).max() < 1e-8 * np.abs(expected).max()
 
 
+@pytest.mark.parametrize("noise", [lambda z: 100.0 * np.exp(0.8 * z), lambda z: np.where(z > 0.0, 100.0, np.inf)])
+def test_mean_of_noise_equals_the_trace(noise) -> None:
+    """Uneven noise of all of the sky, and half of it hidden: Tr[C^-1 N C^-1 Y_l] over the response to a flat C_l."""
+    sky_lmax = LMAX + 6
+    degrees = np.array([ell for ell, _ in unit_skies(sky_lmax)])
+    cl, window = np.resize(CL, sky_lmax + 1), np.ones(sky_lmax + 1)
+    cl[LMAX + 1 :] = 3000.0 / np.arange(LMAX + 1.0, sky_lmax + 1.0) ** 2
+    z = healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[2]
+    precision = noise(z) ** -2.0
+    response = convolve.response(Beam.gaussian(900.0, sky_lmax), sky_lmax, window)
+    one = MapFilter("map", InverseCovariance(cl, [ObservedMap(response, precision)]), window, LMAX)
+    seen = precision > 0.0
+    pixels = np.stack([healpy.alm2map(sky, NSIDE, lmax=sky_lmax)[seen] for _, sky in unit_skies(sky_lmax)], axis=1)
+    sky = pixels * response.factors[0].real[degrees]
+    operator = np.linalg.solve((sky * cl[degrees]) @ sky.T + np.diag(1.0 / precision[seen]), pixels).T
+    through, answer = operator**2 @ (1.0 / precision[seen]), ((operator @ pixels) ** 2).sum(axis=1)
+    exact = np.bincount(degrees, through) / np.bincount(degrees, answer)
+    # Pixels that are not seen have noise of their own, which is none of the map's.
+    variance = np.where(seen, np.divide(1.0, precision, out=np.full(z.size, 1e6), where=seen), 1e6)
+    found = one.noise(variance * 4.0 * np.pi / z.size)
+    # The wavelengths of l = 2 and 3 are about that of the half itself.
+    np.testing.assert_allclose(found[4 : LMAX + 1], exact[4 : LMAX + 1], rtol=0.05)
+
+
 def unitary() -> tuple[np.ndarray, list[tuple[int, int]]]:
     """Coefficients a_lm, m of both signs, of the unit skies, and their (l, m)."""
     indices = [(ell, m) for ell in range(LMAX + 1) for m in range(-ell, ell + 1)]
