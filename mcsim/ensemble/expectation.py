@@ -210,6 +210,6 @@ def noise_mean(survey: Survey, number: int, modes: Sequence[Indices]) -> NDArray
         cl = survey.filtering.filters[number].noise(power)[: lmax + 1]
         found[isotropic] = (-1.0) ** ell * np.sqrt(2.0 * ell + 1.0) * cl
         return found
-    weight = m.weight
+    weight = m.left_to_apply
     variance = map_harmonics(power if weight is None else power * weight**2, L_max)
     return without_windows(survey, noise_biposh(modes, variance, lmax), modes, (number, number))

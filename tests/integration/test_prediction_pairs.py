@@ -33,7 +33,7 @@ def lopsided_moments(path: Path, psi0: float) -> str:
     return str(path)
 
 
-def two_channels(folder: Path, noise: float, **maps: Any) -> Survey:
+def two_channels(folder: Path, noise: float, preparation: tuple[Any, ...] = (), **maps: Any) -> Survey:
     shapes = {"A": (300.0, 250.0, 0.0), "B": (330.0, 270.0, 0.7)}
     channels = [
         {
@@ -55,6 +55,7 @@ def two_channels(folder: Path, noise: float, **maps: Any) -> Survey:
         "sky": {"spectrum": "wmap7", "lmax": LMAX},
         "map": {"nside": NSIDE, **maps},
         "channel": channels,
+        "preparation": list(preparation),
         "biposh": {"L_max": 2, "summary_bin": BIN},
         "ensemble": {"realizations": SKIES, "seed": 3},
     }
@@ -189,6 +190,17 @@ def test_masks_of_two_maps_are_predicted(holes: bool, tmp_path: Path, monkeypatc
     leading = prediction.predict(shared)
     left = np.nanmax(np.abs(leading["biposh_difference_mean"].values - difference))
     assert left < 0.15 * np.nanmax(np.abs(difference))
+
+
+def test_a_mask_as_a_step_has_the_noise_of_one_of_the_map(tmp_path: Path) -> None:
+    mask = np.sin(0.5 * np.pi * np.clip((X + 0.8) / 0.9, 0.0, 1.0)) ** 2
+    healpy.write_map(tmp_path / "mask.fits", mask, dtype=np.float64, coord="E")
+    masked = two_channels(tmp_path, 600.0, mask=str(tmp_path / "mask.fits")).config
+    step = {"kind": "mask", "mask": str(tmp_path / "mask.fits")}
+    as_step = two_channels(tmp_path, 600.0, preparation=(step,)).config
+    expected, found = (prediction.predict(run, L_moments=16) for run in (masked, as_step))
+    for name in ("cl_mean", "biposh_mean", "biposh_standard_deviation"):
+        xr.testing.assert_allclose(found[name], expected[name], rtol=1e-10)
 
 
 @pytest.mark.parametrize(
