@@ -6,8 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.bipolar.modes import Mode, existing
-from mcsim.bipolar.theory import Spectra, fisher_information, isotropic_variance, signal_to_noise
-from mcsim.ensemble.expectation import Means
+from mcsim.bipolar.theory import (
+    FULL_SKY,
+    Overlap,
+    Spectra,
+    fisher_information,
+    isotropic_variance,
+    overlap,
+    signal_to_noise,
+)
+from mcsim.ensemble import plan, summary
+from mcsim.ensemble.expectation import L_WEIGHTS, Means
 from mcsim.simulation.survey import Survey
 
 MONOPOLE = Mode(0, 0, 0)
@@ -31,16 +40,42 @@ def sky_fraction(survey: Survey, pair: tuple[int, int]) -> float:
     return float(np.mean(x * y) ** 2 / np.mean((x * y) ** 2))
 
 
-def variance_of(survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[int, int]) -> NDArray[np.float64]:
-    """Return E|A - mean|^2 of an isotropic sky with these spectra, shape (mode, lmax + 1)."""
+def _overlap(survey: Survey, pair: tuple[int, int], reach: int) -> Overlap:
+    """Return how the weights of a pair of maps correlate degrees, up to ``reach`` apart.
+
+    Filtered maps count as of independent degrees of the observed sky.
+    """
+    weights = [survey.maps[index].weight for index in pair]
+    if survey.filtering is not None:
+        return Overlap(*np.full((2, 1), 1.0 / sky_fraction(survey, pair)))
+    if weights[0] is None and weights[1] is None:
+        return FULL_SKY
+    npix = next(weight.size for weight in weights if weight is not None)
+    x, y = (np.ones(npix) if weight is None else weight for weight in weights)
+    return overlap(x, y, reach, L_WEIGHTS[-1])
+
+
+def variances_of(
+    survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return E|A - mean|^2 of an isotropic sky, shape (mode, lmax + 1), and that of binned spectra, (mode, bin)."""
+    layout = plan.layout(survey)
+    spectra = _spectra(survey, found, pair)
+    reach = min(layout.bin_width - 1, survey.lmax)
+    weights = _overlap(survey, pair, reach)
+    absent = np.isnan(found[pair].beam)
+    shifted = [
+        np.where(absent, np.nan, isotropic_variance(survey.estimator.modes, spectra, weights, shift))
+        for shift in range(weights.autos.size)
+    ]
+    return shifted[0], summary.binned_variance(layout, shifted)
+
+
+def _spectra(survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[int, int], share: float = 1.0) -> Spectra:
+    """Return the total spectra of a pair, with a share of the square of the cross spectrum."""
     x, y = pair
-    xx, yy, xy = (_total_cl(survey, found, p) for p in ((x, x), (y, y), pair))
-    modes = survey.estimator.modes
-    variance = np.empty((len(modes), survey.lmax + 1))
-    anisotropic = [row for row, (L, _, _) in enumerate(modes) if L > 0]
-    variance[anisotropic] = isotropic_variance([modes[row] for row in anisotropic], Spectra(xx, yy, xy))
-    variance[modes.index(MONOPOLE)] = xx * yy + xy**2
-    return np.where(np.isnan(found[pair].beam), np.nan, variance / sky_fraction(survey, pair))
+    xx, yy, xy = (_total_cl(survey, found, one) for one in ((x, x), (y, y), pair))
+    return Spectra(xx, yy, np.sqrt(share) * xy)
 
 
 def variables(survey: Survey, found: dict[tuple[int, int], Means], joint: float) -> dict[str, tuple[Any, ...]]:
@@ -54,7 +89,7 @@ def variables(survey: Survey, found: dict[tuple[int, int], Means], joint: float)
     binned = np.full((*each.shape, len(first)), np.nan)
     for number, (x, y) in enumerate(survey.pairs):
         signal = (found[x, y].beam - found[x, y].circular)[rows]
-        spectra = Spectra(*(_total_cl(survey, found, pair) for pair in ((x, x), (y, y), (x, y))))
+        spectra = _spectra(survey, found, (x, y), _overlap(survey, (x, y), 0).shared)
         f_sky = sky_fraction(survey, (x, y))
         each[number, rows] = signal_to_noise(signal, anisotropic, spectra, f_sky)
         for b, ells in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
@@ -69,14 +104,20 @@ def variables(survey: Survey, found: dict[tuple[int, int], Means], joint: float)
 
 
 def joint_signal_to_noise(survey: Survey, found: dict[tuple[int, int], Means]) -> float:
-    """Return the root of the Fisher information of all maps; infinite for several without noise."""
+    """Return the root of the Fisher information of all maps; infinite for several without noise.
+
+    Degrees at which masks and the orders of beams that are left out leave no covariance are left out.
+    """
     size, lmax = len(survey.map_names), survey.lmax
+    if sum(m.noise_uk is None or not m.noise_uk.any() for m in survey.maps) > 1:
+        return float("inf")
     stored = survey.estimator.modes
     modes = [mode for mode in stored if mode.L > 0 and mode.d >= 0]
     cl = np.empty((size, size, lmax + 1))
     signal = np.zeros((size, size, len(modes), lmax + 1), dtype=np.complex128)
     for x, y in found:
-        cl[x, y] = cl[y, x] = _total_cl(survey, found, (x, y))
+        share = _overlap(survey, (x, y), 0).shared
+        cl[x, y] = cl[y, x] = np.sqrt(share) * _total_cl(survey, found, (x, y))
         beam = np.nan_to_num(found[x, y].beam - found[x, y].circular)
         for row, (L, M, d) in enumerate(modes):
             signal[x, y, row] = beam[stored.index(Mode(L, M, d))]
@@ -84,11 +125,5 @@ def joint_signal_to_noise(survey: Survey, found: dict[tuple[int, int], Means]) -
                 # A^{LM}_{l1 l2} of the exchanged pair is (-1)^{l1+l2+L} A^{LM}_{l2 l1}.
                 l2 = np.flatnonzero(existing(L, d, lmax))
                 signal[y, x, row, l2] = (-1) ** (L + d) * beam[stored.index(Mode(L, M, -d)), l2 - d]
-    if size > 1:
-        diagonal = np.sqrt(np.einsum("xxl->xl", cl))
-        seen = (diagonal > 0.0).all(axis=0)
-        correlation = (cl / np.where(seen, diagonal[:, None] * diagonal, 1.0))[:, :, seen]
-        if np.any(np.linalg.eigvalsh(np.moveaxis(correlation, -1, 0))[:, 0] < 1e-12):
-            return float("inf")
     f_sky = min(sky_fraction(survey, pair) for pair in found)
     return float(np.sqrt(fisher_information(signal, modes, cl, f_sky)))

@@ -27,16 +27,36 @@ def _factors(modes: tuple[Mode, ...], lmax: int) -> NDArray[np.float64]:
     return np.stack([bin_factor(mode, lmax) for mode in modes])
 
 
-def binned(layout: Layout, values: NDArray, power: int = 1) -> NDArray:
-    """Return the mean of factor * A over the existing coefficients of each bin, shape (..., mode, bin).
+def binned(layout: Layout, values: NDArray) -> NDArray:
+    """Return the mean of factor * A over the existing coefficients of each bin, shape (..., mode, bin)."""
+    scaled = _factors(layout.modes, layout.lmax) * values
+    total, count = _sums(layout, scaled)
+    return divided(total, count, np.nan)
 
-    With ``power`` 2 the values are variances of coefficients, independent from ell to ell; return that of the mean.
+
+def binned_variance(layout: Layout, shifted: Sequence[NDArray]) -> NDArray:
+    """Return the variance of :func:`binned`, shape (..., mode, bin).
+
+    ``shifted`` are the variances of coefficients, and their covariances with those n = 1, 2, ... degrees above, up to
+    the sign that the factors take out; each of shape (..., mode, lmax + 1).
     """
-    scaled = _factors(layout.modes, layout.lmax) ** power * values
-    exists = np.isfinite(scaled)
-    total = np.add.reduceat(np.where(exists, scaled, 0.0), layout.first_ells(), axis=-1)
-    count = np.add.reduceat(exists, layout.first_ells(), axis=-1, dtype=np.int64)
-    return divided(total, count**power, np.nan)
+    size = np.abs(_factors(layout.modes, layout.lmax))
+    place = np.arange(layout.lmax + 1) // layout.bin_width
+    total, count = _sums(layout, size**2 * shifted[0])
+    for n, covariance in enumerate(shifted[1:], 1):
+        together = place[:-n] == place[n:]
+        products = np.where(together, size[..., :-n] * size[..., n:] * covariance[..., :-n], 0.0)
+        padded = np.concatenate([products, np.zeros((*products.shape[:-1], n))], axis=-1)
+        total = total + 2.0 * _sums(layout, padded)[0]
+    # Of maps without noise and odd L only round-off of either sign remains.
+    return divided(np.maximum(total, 0.0), count**2, np.nan)
+
+
+def _sums(layout: Layout, values: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the sums of the finite values of each bin, and how many there are, shape (..., bin)."""
+    exists = np.isfinite(values)
+    total = np.add.reduceat(np.where(exists, values, 0.0), layout.first_ells(), axis=-1)
+    return total, np.add.reduceat(exists, layout.first_ells(), axis=-1, dtype=np.int64)
 
 
 def reduce_rows(layout: Layout, rows: Mapping[str, NDArray]) -> Sums | None:

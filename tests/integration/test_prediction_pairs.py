@@ -149,6 +149,31 @@ def test_joint_signal_to_noise_is_at_least_that_of_every_mode_and_less_than_infi
     assert np.isinf(quiet["signal_to_noise_total"])
 
 
+def test_two_masks_leave_errors_and_a_finite_signal_to_noise(tmp_path: Path) -> None:
+    """At low l (C^XY)^2 is above C^XX C^YY of the masked maps; the errors of 150 skies, over all M of odd L."""
+    for name, height in (("A", Z), ("B", 0.5 * X + 0.8 * Z)):
+        mask = np.clip(np.abs(height) / 0.5, 0.0, 1.0) ** 2
+        healpy.write_map(tmp_path / f"mask-{name}.fits", mask, dtype=np.float64, coord="E")
+    run = two_channels(tmp_path, 60.0, mask=str(tmp_path / "mask-{channel}.fits")).config
+    shared = survey(
+        replace(run, sky=replace(run.sky, lmax=24), biposh=replace(run.biposh, summary_bin=8, iterations=1))
+    )
+    expected = prediction.predict(shared, snr=True, L_moments=24)
+    total = float(expected["signal_to_noise_total"])
+    assert np.sqrt(float((expected["signal_to_noise"][[0, 2]] ** 2).sum())) < total < 10.0
+    cl = expected["cl_circular_mean"].values
+    assert (cl[1] ** 2 > cl[0] * cl[2])[2:].any()
+    skies = np.array([simulate.realize(shared, r)["biposh_circular"][1] for r in range(150)])
+    for L in (1, 2):
+        rows = [shared.estimator.modes.index(Mode(L, M, 0)) for M in range(L + 1)]
+        orders = np.array([1.0] + [2.0] * L) / (2 * L + 1)
+        measured = orders @ skies[:, rows, 8:].var(axis=0, ddof=1)
+        predicted = orders @ expected["biposh_circular_standard_deviation"].values[1, rows, 8:] ** 2
+        # Variances of 2 L + 1 numbers of 150 skies at 17 degrees, which are about independent.
+        scatter = np.sqrt(2.0 / (150 * (2 * L + 1) * measured.size))
+        assert abs(np.mean(measured / predicted) - 1.0) < 4.0 * scatter
+
+
 def exact_mean(shared: Survey, monkeypatch: pytest.MonkeyPatch) -> dict[str, np.ndarray]:
     """The expectation of what a run measures: the sum over all coefficients of the sky, one at a time."""
     assert shared.cl is not None

@@ -128,7 +128,7 @@ def test_user_errors():
     with refused("d=-1"):
         fisher_information(signal[None, None], [(2, 0, -1)], cl[None, None])
     with refused("L=0"):
-        isotropic_variance([(0, 0, 0)], Spectra(cl))
+        signal_to_noise(signal, [(0, 0, 0)], Spectra(cl))
     with refused("(1, 4)", "(1, 5)"):
         signal_to_noise(signal[:, :4], [(2, 0, 0)], Spectra(cl))
     with refused("y", "ell = 2", "lmax", 4):

@@ -6,10 +6,20 @@ each checks the other.
 
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh
 from mcsim.bipolar.theory.cmb_biposh import cmb_biposh_exact, cmb_biposh_leading, noise_biposh
-from mcsim.bipolar.theory.detectability import Spectra, fisher_information, isotropic_variance, signal_to_noise
+from mcsim.bipolar.theory.detectability import (
+    FULL_SKY,
+    Overlap,
+    Spectra,
+    fisher_information,
+    isotropic_variance,
+    overlap,
+    signal_to_noise,
+)
 from mcsim.bipolar.theory.harmonics import map_harmonics, orientation_harmonics, parallel_transport_harmonics
 
 __all__ = [
+    "FULL_SKY",
+    "Overlap",
     "ScannedBeam",
     "Spectra",
     "beam_biposh",
@@ -20,6 +30,7 @@ __all__ = [
     "map_harmonics",
     "noise_biposh",
     "orientation_harmonics",
+    "overlap",
     "parallel_transport_harmonics",
     "signal_to_noise",
 ]

@@ -1,4 +1,4 @@
-"""Detectability of a BipoSH signal: variances under isotropy, signal to noise and Fisher information."""
+"""Detectability of a BipoSH signal: variances under isotropy, masks or none, signal to noise, Fisher information."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.bipolar.modes import Indices, check_modes, existing
+from mcsim.bipolar.theory.harmonics import map_harmonics, spin_functions
 from mcsim.errors import InputError
 from mcsim.sphere.checks import check_cl, check_shape
 from mcsim.support.arrays import divided
@@ -23,19 +24,58 @@ class Spectra(NamedTuple):
     cross: NDArray[np.float64] | None = None
 
 
-def isotropic_variance(modes: Sequence[Indices], spectra: Spectra) -> NDArray[np.float64]:
-    """Return E|A^{LM}_{l1 l2}|^2 of an isotropic sky for modes (L, M, d), L > 0, of a map or a pair.
+class Overlap(NamedTuple):
+    """How the weights of two maps correlate coefficients A_{l1 l2} and A_{l1+n, l2+n}, at n = 0, 1, ...
 
-    In uK^4, shape (n_mode, lmax + 1), NaN where the mode does not exist.
+    ``autos`` is the factor of C^XX C^YY, and ``cross`` that of (C^XY)^2; one at n = 0 alone without weights.
+    """
+
+    autos: NDArray[np.float64]
+    cross: NDArray[np.float64]
+
+    @property
+    def shared(self) -> float:
+        """Return the share of (C^XY)^2 that counts at a single l: one if both maps have the same weights."""
+        return float(self.cross[0] / self.autos[0])
+
+
+FULL_SKY = Overlap(np.ones(1), np.ones(1))
+
+
+def overlap(x: NDArray[np.float64], y: NDArray[np.float64], reach: int, L_max: int) -> Overlap:
+    """Return the overlap of two weights of pixels, shape (npix,), up to n = ``reach``, from their degrees to ``L_max``.
 
     Notes
     -----
-    C^XX_l1 C^YY_l2 + (-1)^L delta_{l1 l2} (C^XY_l)^2; for one map C_l1 C_l2 (1 + delta_{l1 l2}), L even where l1 = l2.
-    Zero where it is less than 1e-12 of its first term.
+    At l far above the degrees of the weights, a_lm of one l are those of great circles. A product f of weights
+    correlates l and l + n by the n-th Fourier coefficient of f along a circle, whose mean square over all circles is
+    sum_L d^L_{n0}(pi/2)^2 sum_M |f_LM|^2 / 4pi: the squared Funk transform at n = 0, and <f^2> summed over n. Here f
+    is W_x^2 and W_y^2, or twice W_x W_y, over <W_x W_y>. Sums over explicit covariances agree to a few per cent from
+    l = 3 on: tests/unit/test_predict_overlap.py.
+    """
+    own, other, both = (map_harmonics(product, L_max) for product in (x * x, y * y, x * y))
+    degrees = 2.0 * np.arange(L_max + 1) + 1.0
+    share = 4.0 * np.pi / degrees * spin_functions(reach, L_max, np.array([0.5 * np.pi]))[..., 0] ** 2
+    norm = 4.0 * np.pi * np.mean(x * y) ** 2
+    autos = share @ np.sum(own * other.conj(), axis=1).real / norm
+    return Overlap(autos, share @ np.sum(np.abs(both) ** 2, axis=1) / norm)
+
+
+def isotropic_variance(
+    modes: Sequence[Indices], spectra: Spectra, overlap: Overlap = FULL_SKY, shift: int = 0
+) -> NDArray[np.float64]:
+    """Return E|A^{LM}_{l1 l2}|^2 less the mean of an isotropic sky for modes (L, M, d) of a map or a pair.
+
+    In uK^4, shape (n_mode, lmax + 1), NaN where the mode does not exist. With a ``shift`` n it is the covariance with
+    A_{l1+n, l2+n}, up to the alternating sign of A in l.
+
+    Notes
+    -----
+    C^XX_l1 C^YY_l2 + (-1)^L delta_{l1 l2} (C^XY_l)^2, each times its factor of the ``overlap``; for one map
+    C_l1 C_l2 (1 + delta_{l1 l2}), L even where l1 = l2. Variances are zero where they are less than 1e-12 of their
+    first term.
     """
     check_modes(modes)
-    if any(L == 0 for L, _, _ in modes):
-        raise InputError("the variance of L=0 is that of C_l, not of an anisotropy; give modes with L >= 1.")
     x = spectra.x
     lmax = len(x) - 1
     y, cross = (x, x) if spectra.y is None else (spectra.y, spectra.cross)
@@ -46,11 +86,18 @@ def isotropic_variance(modes: Sequence[Indices], spectra: Spectra) -> NDArray[np
         check_shape(cl, (lmax + 1,), name)
     variance = np.full((len(modes), lmax + 1), np.nan)
     for row, (L, _, d) in zip(variance, modes, strict=True):
-        l2 = np.flatnonzero(existing(L, d, lmax))
-        product = x[l2 - d] * y[l2]
-        row[l2] = product + ((-1) ** L * cross[l2] ** 2 if d == 0 else 0.0)
-        # For maps without noise and odd L only round-off of either sign remains.
-        row[l2[row[l2] < 1e-12 * product]] = 0.0
+        there = existing(L, d, lmax)
+        l2 = np.flatnonzero(there[: lmax + 1 - shift] & there[shift:])
+        square = x[l2 - d] * y[l2]
+        if shift:
+            square = np.sqrt(square * x[l2 - d + shift] * y[l2 + shift])
+        product = overlap.autos[shift] * square
+        row[l2] = product
+        if d == 0:
+            row[l2] += (-1) ** L * overlap.cross[shift] * cross[l2] * cross[l2 + shift]
+        if shift == 0:
+            # For maps without noise and odd L only round-off of either sign remains.
+            row[l2[row[l2] < 1e-12 * product]] = 0.0
     return variance
 
 
@@ -75,6 +122,8 @@ def signal_to_noise(
     _check_f_sky(f_sky)
     _check_biposh(biposh, (len(modes), len(spectra.x)))
     first, last = (0, biposh.shape[1] - 1) if ell_range is None else ell_range
+    if any(L == 0 for L, _, _ in modes):
+        raise InputError("the signal of L=0 is that of C_l, not of an anisotropy; give modes with L >= 1.")
     variance = isotropic_variance(modes, spectra)[:, first : last + 1]
     signal = abs(biposh[:, first : last + 1]) ** 2
     ratio = divided(signal, variance)

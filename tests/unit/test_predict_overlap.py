@@ -1,0 +1,124 @@
+"""Variances of A^{LM} of two masked maps against sums over the explicit covariance of their coefficients."""
+
+import healpy
+import numpy as np
+import pytest
+import wignernj
+from scipy.special import sph_harm_y
+
+from mcsim.bipolar.modes import modes as all_modes
+from mcsim.bipolar.theory import FULL_SKY, Spectra, isotropic_variance, overlap
+from mcsim.ensemble import summary
+from mcsim.ensemble.layout import Layout
+
+NSIDE, SKY, LMAX = 8, 20, 14
+THETA, PHI = healpy.pix2ang(NSIDE, np.arange(12 * NSIDE**2))
+X, Y, Z = np.array(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2)))
+INDEX = [(ell, m) for ell in range(SKY + 1) for m in range(-ell, ell + 1)]
+DEGREE = np.array([ell for ell, _ in INDEX])
+PLACE = {key: i for i, key in enumerate(INDEX)}
+CL = 1000.0 / (np.arange(SKY + 1.0) + 1.0)
+
+
+def belt(distance: np.ndarray) -> np.ndarray:
+    """1 far from a plane, 0 on it."""
+    weight = np.clip(np.abs(distance) / 0.6, 0.0, 1.0) ** 2
+    return weight / np.sqrt(np.mean(weight**2))
+
+
+def cap(height: np.ndarray) -> np.ndarray:
+    """0 at one pole, 1 at the other."""
+    weight = np.clip(0.6 + height, 0.0, 1.0)
+    return weight / np.sqrt(np.mean(weight**2))
+
+
+class Masked:
+    """Covariances of the coefficients of two maps of one sky without noise, and their mean pseudo-spectra."""
+
+    def __init__(self, x: np.ndarray, y: np.ndarray) -> None:
+        harmonics = np.stack([sph_harm_y(ell, m, THETA, PHI) for ell, m in INDEX], axis=1)
+        through = [harmonics.conj().T @ (w[:, None] * harmonics) * (4.0 * np.pi / w.size) for w in (x, y)]
+        self.xx, self.yy, self.xy = (
+            (through[i] * CL[DEGREE]) @ through[j].conj().T for i, j in ((0, 0), (1, 1), (0, 1))
+        )
+        self.norm = float(np.mean(x * y))
+
+    def spectra(self) -> Spectra:
+        found = [np.bincount(DEGREE, np.diag(c).real) / np.bincount(DEGREE) for c in (self.xx, self.yy, self.xy)]
+        return Spectra(found[0][: LMAX + 1], found[1][: LMAX + 1], found[2][: LMAX + 1] / self.norm)
+
+    def covariance(self, L: int, d: int, l2: int, shift: int) -> float:
+        """E A_{l1 l2} A*_{l1+n l2+n} less the means, over all M, times the alternating sign."""
+        total = 0.0
+        signs = np.array([(-1.0) ** m for _, m in INDEX])
+        mirrored = [PLACE[ell, -m] for ell, m in INDEX]
+        both = self.xy[:, mirrored] * signs  # <x_i y_j> without a conjugate
+        for M in range(-L, L + 1):
+            (i, j, g), (k, n, h) = (self.terms(L, M, d, ell) for ell in (l2, l2 + shift))
+            first = self.xx[np.ix_(i, k)] * self.yy[np.ix_(n, j)].T
+            second = both[np.ix_(i, n)] * both[np.ix_(k, j)].conj().T
+            total += float((g @ (first + second) @ h).real)
+        return (-1.0) ** shift * total / (2 * L + 1) / self.norm**2
+
+    @staticmethod
+    def terms(L: int, M: int, d: int, l2: int) -> tuple[list[int], list[int], np.ndarray]:
+        l1 = l2 - d
+        orders = [m for m in range(-l1, l1 + 1) if abs(m - M) <= l2]
+        clebsch = [(-1) ** (m - M) * float(wignernj.clebsch_gordan(l1, m, l2, M - m, L, M)) for m in orders]
+        return [PLACE[l1, m] for m in orders], [PLACE[l2, m - M] for m in orders], np.array(clebsch)
+
+
+PAIRS = {
+    "two masks": (belt(Z), belt(0.5 * X + 0.8 * Z)),
+    "a mask and none": (np.ones(Z.size), belt(Z)),
+    "caps": (cap(Z), cap(-Z)),
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_variances_of_masked_pairs_are_sums_over_covariances(name: str) -> None:
+    """All parities, L = 0 among them; where (C^XY)^2 > C^XX C^YY, at low l, errors of odd L were zero."""
+    weights = PAIRS[name]
+    masked = Masked(*weights)
+    spectra = masked.spectra()
+    assert spectra.y is not None
+    assert spectra.cross is not None
+    modes = [(0, 0, 0), (1, 0, 0), (1, 0, 1), (2, 0, 0), (2, 0, -2), (3, 0, 0)]
+    found = overlap(*weights, 2, 16)
+    variance = isotropic_variance(modes, spectra, found)
+    beside = isotropic_variance(modes, spectra, found, 2)
+    for row, (L, _, d) in enumerate(modes):
+        for l2 in (6, 8, 10):
+            scale = found.autos[0] * spectra.x[l2 - d] * spectra.y[l2]
+            assert variance[row, l2] == pytest.approx(masked.covariance(L, d, l2, 0), abs=0.06 * scale)
+            assert beside[row, l2] == pytest.approx(masked.covariance(L, d, l2, 2), abs=0.06 * scale)
+    assert (spectra.cross**2 > spectra.x * spectra.y)[:4].any()
+    assert 0.1 < found.shared < 0.95
+
+
+def test_equal_weights_share_all_and_those_of_all_sky_are_one() -> None:
+    weight = belt(Z)
+    assert overlap(weight, weight, 0, 16).shared == pytest.approx(1.0, rel=1e-12)
+    same = overlap(np.ones(Z.size), np.ones(Z.size), 3, 16)
+    np.testing.assert_allclose(same.autos, [*FULL_SKY.autos, 0.0, 0.0, 0.0], atol=1e-12)
+    # Summed over all distances in l, of both signs, this is the usual <W^4> / <W^2>^2.
+    every = overlap(weight, weight, 23, 23).autos
+    assert every[0] + 2.0 * every[1:].sum() == pytest.approx(np.mean(weight**4), rel=1e-3)
+
+
+def test_variance_of_a_bin_is_that_of_the_sum_of_its_coefficients() -> None:
+    """Coefficients whose sign alternates as those of A^{LM} do, and which correlate up to two degrees apart."""
+    modes, lmax = all_modes(1, both_orders=False), 11
+    layout = Layout(1, 1, ("A",), ("A,A",), modes, lmax, False, None, frame="ecliptic", bin_width=5, filtered=False)
+    rng = np.random.default_rng(2)
+    mixing = np.tril(np.triu(rng.uniform(0.5, 1.0, (lmax + 1, lmax + 1))), 2).T
+    covariance = mixing @ mixing.T
+    weights = summary.binned(layout, np.broadcast_to(np.eye(lmax + 1)[:, None], (lmax + 1, len(modes), lmax + 1)))
+    for row in range(len(modes)):
+        used = np.moveaxis(weights, 0, -1)[row]
+        shifted = np.full((5, len(modes), lmax + 1), np.nan)
+        for n in range(5):
+            shifted[n, row, : lmax + 1 - n] = np.diag(covariance, n)
+        found = summary.binned_variance(layout, list(shifted))[row]
+        expected = np.einsum("bi,ij,bj->b", np.abs(used), covariance, np.abs(used))
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
