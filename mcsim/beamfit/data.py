@@ -96,6 +96,7 @@ class Measurement:
     #: number of realizations that the covariance is estimated from; ``None``: the covariance is known
     simulations: int | None
     realizations: NDArray[np.float64] | None = None  #: data vectors of the realizations, shape (N, p), if known
+    highest: int | None = None  #: highest degree of the maps of the data; ``None``: not known, that of the model
 
     @property
     def modes(self) -> tuple[Mode, ...]:
@@ -109,13 +110,20 @@ class Measurement:
 
 
 def project(
-    rows: Sequence[Row], scaling: Scaling, spectra: Mapping[Mode, NDArray[np.complex128]]
+    rows: Sequence[Row],
+    scaling: Scaling,
+    spectra: Mapping[Mode, NDArray[np.complex128]],
+    highest: int | None = None,
 ) -> NDArray[np.float64]:
-    """Return data vectors, shape (..., rows), of spectra of shape (..., lmax + 1); NaN where a bin is empty."""
+    """Return data vectors, shape (..., rows), of spectra of shape (..., lmax + 1); NaN where a bin is empty.
+
+    Bins have no coefficients with l2 or l1 = l2 - d above ``highest``, where data end that are compared with these.
+    """
     scaled = {mode: scaling.factor(mode, array.shape[-1] - 1) * array for mode, array in spectra.items()}
     columns = []
     for row in rows:
-        inside = scaled[row.mode][..., row.ell_min : row.ell_max + 1]
+        last = row.ell_max if highest is None else min(row.ell_max, highest + min(row.mode.d, 0))
+        inside = scaled[row.mode][..., row.ell_min : last + 1]
         exists = np.isfinite(inside)
         count = exists.sum(axis=-1)
         total = np.where(exists, inside, 0.0).sum(axis=-1)
@@ -153,7 +161,7 @@ def from_store(path: str | Path, selection: Selection = EVERYTHING) -> Measureme
         raise InputError(f"{path} has no {min(absent).name} for the pair {label} at these ell; leave the mode out.")
     drawn = drawn[:, measured]
     value, covariance = drawn.mean(axis=0), _covariance(drawn) / len(drawn)
-    return Measurement(str(path), label, chosen, kept, SUMMARY, value, covariance, len(drawn), drawn)
+    return Measurement(str(path), label, chosen, kept, SUMMARY, value, covariance, len(drawn), drawn, lmax)
 
 
 def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None = None) -> Measurement:
@@ -165,7 +173,7 @@ def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None
     with opening.open_ensemble(path) as ensemble:
         labels = [str(name) for name in ensemble["pair"].values]
     label = pair or (measured.pair if measured.pair in labels else labels[0])
-    drawn = realizations(path, measured.rows, measured.scaling, measured.kind, label)
+    drawn = realizations(path, measured.rows, measured.scaling, measured.kind, label, measured.highest)
     return replace(measured, covariance=_covariance(drawn), simulations=len(drawn))
 
 
@@ -174,8 +182,12 @@ def _covariance(drawn: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.atleast_2d(np.cov(drawn.T, ddof=1))
 
 
-def realizations(path: str | Path, rows: Sequence[Row], scaling: Scaling, kind: str, pair: str) -> NDArray[np.float64]:
+def realizations(
+    path: str | Path, rows: Sequence[Row], scaling: Scaling, kind: str, pair: str, highest: int | None = None
+) -> NDArray[np.float64]:
     """Return data vectors of all finished realizations of a store, shape (N, rows), read chunk by chunk.
+
+    ``highest`` is that of :func:`project`.
 
     InputError if the store has another lmax or lacks the pair, a mode or the circular-beam controls.
     """
@@ -204,7 +216,7 @@ def realizations(path: str | Path, rows: Sequence[Row], scaling: Scaling, kind: 
         if kind == "difference":
             biposh = biposh - arrays["biposh_circular"][done, number]
         spectra = {row.mode: biposh[:, labels[row.mode.name]] for row in rows}
-        found.append(project(rows, scaling, spectra))
+        found.append(project(rows, scaling, spectra, highest))
     joined = np.concatenate(found)
     if len(joined) < 3:
         raise InputError(f"{path} has {len(joined)} finished realizations, too few for a covariance; run more.")

@@ -22,8 +22,9 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
 
     Columns are L, M, d, ell_min, ell_max, value, error, and value_imag if parts are imaginary; ``value`` is the mean
     over ell_min <= l2 <= ell_max, d = l2 - l1, with its unit. The header's ``meta`` holds ``normalisation`` ("Bennett",
-    "WMAP" or "Hajian-Souradeep"), ``scaling`` ("l(l+1)/2pi" or "none") and optionally ``frame``. ``mcsim info
-    --export`` writes such tables, with a column ``pair`` and, for paired ensembles, ``value_difference`` and so on.
+    "WMAP" or "Hajian-Souradeep"), ``scaling`` ("l(l+1)/2pi" or "none") and optionally ``frame`` and ``lmax``, the
+    highest degree of the maps (default: of the configuration). ``mcsim info --export`` writes such tables, with a
+    column ``pair`` and, for paired ensembles, ``value_difference`` and so on.
     ``errors`` False: those of the table do not count, and are one each.
     Raise InputError for a table that cannot be read, or does not define its numbers.
     """
@@ -72,7 +73,8 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
             f"{path}: {row.mode.name} at ell = {row.ell_min}-{row.ell_max} has value {value[bad[0]]:g}, error "
             f"{sigma[bad[0]]:g}; give finite values with errors above 0, or leave the row out."
         )
-    return Measurement(str(path), label, chosen, tuple(rows), scaling, value, np.diag(sigma**2), None)
+    covariance, highest = np.diag(sigma**2), highest_of(path, table.meta)
+    return Measurement(str(path), label, chosen, tuple(rows), scaling, value, covariance, None, highest=highest)
 
 
 def check_frame(path: str | Path, found: str, wanted: str) -> None:
@@ -81,6 +83,14 @@ def check_frame(path: str | Path, found: str, wanted: str) -> None:
         raise InputError(
             f"{path} is in the {found} frame, the configuration in the {wanted} one; rotate the data or set map.frame."
         )
+
+
+def highest_of(path: str | Path, meta: Any) -> int | None:
+    """Read the highest degree of the maps from the header of a table, None without one; InputError for no degree."""
+    given = meta.get("lmax")
+    if given is not None and (isinstance(given, bool) or not isinstance(given, int) or given < 0):
+        raise InputError(f"{path}: lmax = {given!r} in its meta is no degree; write a whole number, or leave it out.")
+    return given
 
 
 def check_parity(path: str | Path, mode: Mode, scaling: Scaling) -> None:

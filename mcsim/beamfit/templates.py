@@ -73,7 +73,8 @@ class Templates:
             seen = seen - self.control
         if self.measured.kind == "plain" and self.pair[0] == self.pair[1]:
             seen = seen + expectation.noise_mean(self.survey, self.pair[0], modes)
-        return project(self.measured.rows, self.measured.scaling, dict(zip(modes, seen, strict=True)))
+        spectra = dict(zip(modes, seen, strict=True))
+        return project(self.measured.rows, self.measured.scaling, spectra, self.measured.highest)
 
     def functions(self, model: Model) -> NDArray:
         """Return g_k(l) at every l of the beams, shape (K, l)."""
@@ -127,10 +128,11 @@ def templates(survey: Survey, measured: Measurement, nthreads: int = 1) -> Templ
     Raise InputError for a survey without a spectrum, with another lmax or other maps, or with circular beams.
     """
     expectation.spectrum(survey)
-    if measured.lmax > survey.lmax:
-        raise InputError(
-            f"the data reach ell = {measured.lmax}, the configuration ends at {survey.lmax}; raise its lmax."
-        )
+    reach = measured.lmax
+    if measured.highest is not None:
+        reach = max(reach, *(min(row.ell_max - min(row.mode.d, 0), measured.highest) for row in measured.rows))
+    if reach > survey.lmax:
+        raise InputError(f"the data reach ell = {reach}, the configuration ends at {survey.lmax}; raise its lmax.")
     pair = _maps_of(survey, measured.pair)
     beams = expectation.scanned_beams(survey, expectation.moments_needed(survey, exact=True), nthreads)
     x, y = (beams[number] for number in pair)

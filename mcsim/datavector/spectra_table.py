@@ -10,8 +10,9 @@ import numpy as np
 
 from mcsim import config
 from mcsim.beamfit.data import Row, Scaling, project
-from mcsim.beamfit.table import check_frame, check_parity, identified, in_uk2, read_ecsv, scaling_of
+from mcsim.beamfit.table import check_frame, check_parity, highest_of, identified, in_uk2, read_ecsv, scaling_of
 from mcsim.bipolar import Mode
+from mcsim.bipolar.modes import existing
 from mcsim.datavector.analysis import Analysis, Job, analysis_of, kinds_of, surveys
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Block, Element
@@ -51,6 +52,7 @@ class Spectra:
     value: Vector  # uK^2, shape (p,)
     error: Vector  # the same, NaN where the table has none
     realizations: int  # skies that the values are the mean of
+    highest: int | None = None  # highest degree of the maps of the data; None: that of the model
 
     @property
     def elements(self) -> tuple[Element, ...]:
@@ -76,7 +78,7 @@ class Spectra:
         columns = []
         for row, pair in zip(self.rows, self.pairs, strict=True):
             where = shared.pair_names.index(pair.label), shared.estimator.modes.index(row.mode)
-            columns.append(project([row], self.scaling, {row.mode: biposh[:, *where]}))
+            columns.append(project([row], self.scaling, {row.mode: biposh[:, *where]}, self.highest))
         return np.concatenate(columns, axis=1)
 
     def views(self) -> Iterator[tuple[Element, Vector]]:
@@ -110,11 +112,11 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
     in the Bennett normalisation are C_l. Several pairs stand together; without a column ``pair`` the table belongs to
     the first map. Without ``value_imag`` only real parts are used; ``error`` may be left out. The header's ``meta``
     must give ``normalisation``, ``scaling`` and, unless all rows have L = 0, ``frame``; ``realizations`` says of how
-    many skies the values are the mean (default: 1).
+    many skies the values are the mean (default: 1), ``lmax`` where the maps end (default: as the model).
     """
     table = read_ecsv(path)
     scaling, known, lmax = scaling_of(path, table.meta), _pairs(run), config.analysis_lmax(run)
-    absent = np.full(len(table), np.nan)
+    absent, highest = np.full(len(table), np.nan), highest_of(path, table.meta)
     real = in_uk2(path, table, "value")
     imag, stated = (in_uk2(path, table, name) if name in table.colnames else absent for name in ("value_imag", "error"))
     found: dict[tuple[Row, Pair], tuple[float, float]] = {}
@@ -124,7 +126,7 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
             raise InputError(f"{path}: {label} is no pair of the model's maps; use one of {'; '.join(known)}.")
         mode, pair = Mode(L, M, d), known[label]
         check_parity(path, mode, scaling)
-        _check_row(path, Row(mode, low, high, False), pair, lmax)
+        _check_row(path, Row(mode, low, high, False), pair, lmax, highest)
         for imaginary in mode.parts:
             key, value = (Row(mode, low, high, imaginary), pair), float((imag if imaginary else real)[number])
             if imaginary and not np.isfinite(value):
@@ -145,7 +147,7 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
     count = table.meta.get("realizations", 1)
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise InputError(f"{path} is the mean of {count!r} realizations; give a whole number from 1 in its meta.")
-    return Spectra(str(path), frame, rows, pairs, scaling, value, error, count)
+    return Spectra(str(path), frame, rows, pairs, scaling, value, error, count, highest)
 
 
 def _pairs(run: config.RunConfig) -> dict[str, Pair]:
@@ -157,7 +159,7 @@ def _pairs(run: config.RunConfig) -> dict[str, Pair]:
     return found
 
 
-def _check_row(path: str | Path, row: Row, pair: Pair, lmax: int) -> None:
+def _check_row(path: str | Path, row: Row, pair: Pair, lmax: int, highest: int | None) -> None:
     """Raise InputError for a mode or a bin that the pair does not have."""
     mode, low, high, _ = row
     if not (0 <= mode.M <= mode.L and abs(mode.d) <= mode.L):
@@ -167,9 +169,7 @@ def _check_row(path: str | Path, row: Row, pair: Pair, lmax: int) -> None:
             f"{path}: the bin ell = {low} ... {high} is not within 0 ... {lmax}, the model's analysis; leave the "
             "row out or raise sky.lmax."
         )
-    ell = np.arange(low, high + 1)
-    other = ell - mode.d
-    exists = (other >= 0) & (other <= lmax) & (other + ell >= mode.L)
+    exists = existing(mode.L, mode.d, lmax if highest is None else min(lmax, highest))[low : high + 1]
     if not exists.any() or (pair.auto and not mode.in_auto):
         raise InputError(
             f"{path}: there is no {mode.name} of {pair.label} at l2 = {low} ... {high}, or it repeats another; leave "

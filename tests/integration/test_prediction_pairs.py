@@ -10,8 +10,10 @@ import pytest
 import xarray as xr
 from scipy import stats
 
+import mcsim
 from mcsim import beamfit, config
 from mcsim.beamfit.data import SUMMARY, Row, project
+from mcsim.beamfit.templates import templates
 from mcsim.bipolar.modes import Mode
 from mcsim.ensemble import describe, prediction, tables
 from mcsim.instrument import scan
@@ -286,3 +288,29 @@ def test_a_plain_spectrum_is_fitted_with_its_noise(tmp_path: Path) -> None:
         measured = beamfit.measurement(tmp_path / "two.ecsv", shared, beamfit.Selection(kind="plain", pair=pair))
         found = beamfit.fit(measured, shared, order="leading")
         assert found.solution.parameters == pytest.approx([1.0], abs=1e-6)
+
+
+def test_a_fit_ends_where_the_data_do(tmp_path: Path) -> None:
+    """A bin of d < 0 holds l1 up to the lmax of the data, whatever that of the configuration; in tables and stores."""
+    run = two_channels(tmp_path, 60.0).config
+    longer = survey(run)
+    shared = survey(replace(run, biposh=replace(run.biposh, lmax=40), ensemble=replace(run.ensemble, realizations=3)))
+    expected = prediction.predict(shared)
+    for one in ("standard_deviation", "standard_error"):
+        expected[f"biposh_difference_binned_{one}"] = expected[f"biposh_binned_{one}"]
+    tables.write(expected, tmp_path / "data.ecsv")
+    mcsim.run(shared.config, tmp_path / "data.zarr", workers=1)
+    chosen = beamfit.Selection(modes=["L2M0d0", "L2M0d2", "L2M0d-2"], pair="A,B")
+    for name in ("data.ecsv", "data.zarr"):
+        measured = beamfit.measurement(tmp_path / name, shared, chosen)
+        assert measured.rows[-1][:3] == (Mode(2, 0, -2), 32, 40)
+        ones = np.ones(LMAX + 1)
+        same, other = (templates(one, measured).data(ones) for one in (shared, longer))
+        np.testing.assert_allclose(other, same, rtol=1e-10)
+        if name == "data.ecsv":
+            np.testing.assert_allclose(measured.value, same, rtol=1e-10)
+    # Bins up to 31 of d = -2 hold l1 = 33.
+    low = beamfit.measurement(tmp_path / "data.ecsv", shared, replace(chosen, ell_range=(0, 31)))
+    short = survey(replace(run, biposh=replace(run.biposh, lmax=31)))
+    with refused("ell = 33", "31", "lmax"):
+        templates(short, low)

@@ -46,6 +46,13 @@ def test_rows_values_and_independent_errors(tmp_path):
     assert (found.simulations, found.kind, found.pair) == (None, "plain", None)
 
 
+def test_the_header_says_where_the_maps_end(tmp_path):
+    assert read(tmp_path, table()).highest is None
+    assert read(tmp_path, table(META | {"lmax": 40})).highest == 40
+    with refused("lmax", "40.5"):
+        read(tmp_path, table(META | {"lmax": 40.5}))
+
+
 def test_units_are_converted(tmp_path):
     np.testing.assert_allclose(read(tmp_path, table(unit="mK2")).value, [1e6, 2e6, 3e6])
 
