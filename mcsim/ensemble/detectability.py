@@ -47,7 +47,7 @@ def _overlap(survey: Survey, pair: tuple[int, int], reach: int) -> Overlap:
     """
     weights = [survey.maps[index].weight for index in pair]
     if survey.filtering is not None:
-        return Overlap(*np.full((2, 1), 1.0 / sky_fraction(survey, pair)))
+        return Overlap(*np.full((2, 1, 1), 1.0 / sky_fraction(survey, pair)))
     if weights[0] is None and weights[1] is None:
         return FULL_SKY
     npix = next(weight.size for weight in weights if weight is not None)
@@ -66,7 +66,7 @@ def variances_of(
     absent = np.isnan(found[pair].beam)
     shifted = [
         np.where(absent, np.nan, isotropic_variance(survey.estimator.modes, spectra, weights, shift))
-        for shift in range(weights.autos.size)
+        for shift in range(len(weights.autos))
     ]
     return shifted[0], summary.binned_variance(layout, shifted)
 

@@ -1,10 +1,12 @@
 """Detectability of a BipoSH signal: variances under isotropy, masks or none, signal to noise, Fisher information."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import eval_legendre
 
 from mcsim.bipolar.modes import Indices, check_modes, existing
 from mcsim.bipolar.theory.harmonics import map_harmonics, spin_functions
@@ -25,9 +27,9 @@ class Spectra(NamedTuple):
 
 
 class Overlap(NamedTuple):
-    """How the weights of two maps correlate coefficients A_{l1 l2} and A_{l1+n, l2+n}, at n = 0, 1, ...
+    """How the weights of two maps correlate coefficients A_{l1 l2} and A_{l1+n, l2+n}, by degrees of the weights.
 
-    ``autos`` is the factor of C^XX C^YY, and ``cross`` that of (C^XY)^2; one at n = 0 alone without weights.
+    Factors of C^XX C^YY and of (C^XY)^2 for L = 0 or high l are sums over degrees; shape (n, degree of weights).
     """
 
     autos: NDArray[np.float64]
@@ -36,10 +38,23 @@ class Overlap(NamedTuple):
     @property
     def shared(self) -> float:
         """Return the share of (C^XY)^2 that counts at a single l: one if both maps have the same weights."""
-        return float(self.cross[0] / self.autos[0])
+        return float(self.cross[0].sum() / self.autos[0].sum())
+
+    def factors(self, L: int, shift: int, lmax: int) -> NDArray[np.float64]:
+        """Return both factors of A^{LM} at (l1 + l2 + n) / 2 = 0, 1/2, 1, ..., lmax, shape (2, 2 lmax + 1)."""
+        coupled = _coupling(L, self.autos.shape[1], lmax)
+        return np.stack([coupled @ self.autos[shift], coupled @ self.cross[shift]])
 
 
-FULL_SKY = Overlap(np.ones(1), np.ones(1))
+@lru_cache(maxsize=16)
+def _coupling(L: int, size: int, lmax: int) -> NDArray[np.float64]:
+    """Return (-1)^(L+K) (2l+1) {l l L; l l K}, about, at l = 0, 1/2, ..., lmax, shape (2 lmax + 1, size of K)."""
+    ell, degree = np.arange(2 * lmax + 1)[:, None] / 2.0, np.arange(size)
+    angle = divided(degree * (degree + 1.0), 2.0 * ell * (ell + 1.0))
+    return np.where(degree <= 2.0 * ell, eval_legendre(L, 1.0 - angle), 0.0)
+
+
+FULL_SKY = Overlap(np.ones((1, 1)), np.ones((1, 1)))
 
 
 def overlap(x: NDArray[np.float64], y: NDArray[np.float64], reach: int, L_max: int) -> Overlap:
@@ -49,16 +64,17 @@ def overlap(x: NDArray[np.float64], y: NDArray[np.float64], reach: int, L_max: i
     -----
     At l far above the degrees of the weights, a_lm of one l are those of great circles. A product f of weights
     correlates l and l + n by the n-th Fourier coefficient of f along a circle, whose mean square over all circles is
-    sum_L d^L_{n0}(pi/2)^2 sum_M |f_LM|^2 / 4pi: the squared Funk transform at n = 0, and <f^2> summed over n. Here f
-    is W_x^2 and W_y^2, or twice W_x W_y, over <W_x W_y>. Sums over explicit covariances agree to a few per cent from
-    l = 3 on: tests/unit/test_predict_overlap.py.
+    sum_K d^K_{n0}(pi/2)^2 sum_N |f_KN|^2 / 4pi: the squared Funk transform at n = 0, and <f^2> summed over n. Here f
+    is W_x^2 and W_y^2, or twice W_x W_y, over <W_x W_y>. A^{LM} couples degree K of f by the 6j symbol
+    (-1)^(L+K) (2l+1) {l l L; l l K}, about P_L(1 - K(K+1)/(2l(l+1))), which is exact for L = 0 and 1, where K <= 2l.
+    Sums over explicit covariances agree to a few per cent from l = 2 on: tests/unit/test_predict_overlap.py.
     """
     own, other, both = (map_harmonics(product, L_max) for product in (x * x, y * y, x * y))
     degrees = 2.0 * np.arange(L_max + 1) + 1.0
     share = 4.0 * np.pi / degrees * spin_functions(reach, L_max, np.array([0.5 * np.pi]))[..., 0] ** 2
-    norm = 4.0 * np.pi * np.mean(x * y) ** 2
-    autos = share @ np.sum(own * other.conj(), axis=1).real / norm
-    return Overlap(autos, share @ np.sum(np.abs(both) ** 2, axis=1) / norm)
+    share /= 4.0 * np.pi * np.mean(x * y) ** 2
+    autos = np.sum(own * other.conj(), axis=1).real
+    return Overlap(share * autos, share * np.sum(np.abs(both) ** 2, axis=1))
 
 
 def isotropic_variance(
@@ -85,16 +101,20 @@ def isotropic_variance(
         check_cl(cl, lmax, name, cross=name == "cross")
         check_shape(cl, (lmax + 1,), name)
     variance = np.full((len(modes), lmax + 1), np.nan)
+    factors: dict[int, NDArray[np.float64]] = {}
     for row, (L, _, d) in zip(variance, modes, strict=True):
         there = existing(L, d, lmax)
         l2 = np.flatnonzero(there[: lmax + 1 - shift] & there[shift:])
         square = x[l2 - d] * y[l2]
         if shift:
             square = np.sqrt(square * x[l2 - d + shift] * y[l2 + shift])
-        product = overlap.autos[shift] * square
+        if L not in factors:
+            factors[L] = overlap.factors(L, shift, lmax)
+        first, second = factors[L][:, 2 * l2 - d + shift]
+        product = first * square
         row[l2] = product
         if d == 0:
-            row[l2] += (-1) ** L * overlap.cross[shift] * cross[l2] * cross[l2 + shift]
+            row[l2] += (-1) ** L * second * cross[l2] * cross[l2 + shift]
         if shift == 0:
             # For maps without noise and odd L only round-off of either sign remains.
             row[l2[row[l2] < 1e-12 * product]] = 0.0
