@@ -138,7 +138,9 @@ def from_store(path: str | Path, selection: Selection = EVERYTHING) -> Measureme
     Raise InputError if the store lacks what is selected.
     """
     with opening.open_ensemble(path) as ensemble:
-        width = int(ensemble.attrs["configuration"]["biposh"]["summary_bin"])
+        biposh = ensemble.attrs["configuration"]["biposh"]
+        refuse_filtered(path, biposh.get("filter", "none"))
+        width = int(biposh["summary_bin"])
         lmax = ensemble.sizes["ell"] - 1
         paired = "biposh_circular" in ensemble
         label = str(ensemble["pair"].values[0]) if selection.pair is None else selection.pair
@@ -162,6 +164,15 @@ def from_store(path: str | Path, selection: Selection = EVERYTHING) -> Measureme
     drawn = drawn[:, measured]
     value, covariance = drawn.mean(axis=0), _covariance(drawn) / len(drawn)
     return Measurement(str(path), label, chosen, kept, SUMMARY, value, covariance, len(drawn), drawn, lmax)
+
+
+def refuse_filtered(path: str | Path, name: str) -> None:
+    """Raise InputError for spectra that a filter has made, whose response to a beam is not that of the templates."""
+    if name != "none":
+        raise InputError(
+            f"{path} has spectra of maps with filter = {name!r}, whose response to a beam is not that of the fitted "
+            'templates; run them with biposh.filter = "none", and fit those.'
+        )
 
 
 def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None = None) -> Measurement:

@@ -9,7 +9,7 @@ from astropy import units
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from mcsim.beamfit.data import EVERYTHING, SUMMARY, Measurement, Row, Scaling, Selection
+from mcsim.beamfit.data import EVERYTHING, SUMMARY, Measurement, Row, Scaling, Selection, refuse_filtered
 from mcsim.bipolar import Mode
 from mcsim.errors import InputError
 from mcsim.support.folders import unreadable
@@ -29,6 +29,7 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
     Raise InputError for a table that cannot be read, or does not define its numbers.
     """
     table = read_ecsv(path)
+    refuse_filtered(path, str(table.meta.get("filter", "none")))
     suffix, chosen = _kind(path, table, selection.kind)
     scaling = scaling_of(path, table.meta)
     check_frame(path, str(table.meta.get("frame", frame)).lower(), frame)

@@ -55,6 +55,8 @@ def table(summary: xr.Dataset) -> Table:
     result.meta |= {name: summary.attrs[name] for name in origin if name in summary.attrs}
     if "count" in summary:
         result.meta["realizations"] = int(summary["count"])
+    if "biposh_qml_mean" in summary:
+        result.meta["filter"] = "inverse_covariance"
     if "ell" in summary.sizes:
         result.meta["lmax"] = summary.sizes["ell"] - 1
     result.meta["scaling"] = "l(l+1)/2pi A, mean over ell_min <= l2 <= ell_max"

@@ -7,8 +7,9 @@ import pytest
 import xarray as xr
 from distributed import Client
 
-from mcsim import config, merge, open_ensemble, open_summary, predict, run
+from mcsim import config, fit, merge, open_ensemble, open_summary, predict, run
 from mcsim.ensemble import plan
+from mcsim.ensemble.tables import write
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from refusals import refused
@@ -122,3 +123,12 @@ def test_dry_run_says_what_the_filter_costs(table, monkeypatch: pytest.MonkeyPat
     plain = config.load(table).unfiltered()
     assert "filter" not in dict(plan.cost(plain).parts)
     assert found.each_s > 3.0 * plan.cost(plain).each_s
+
+
+def test_a_fit_refuses_filtered_coefficients(table, store: Path, tmp_path: Path) -> None:
+    """Behind a mask their response to a beam is not that of its templates; their tables say what they are, too."""
+    with open_summary(store) as found:
+        write(found.load(), tmp_path / "table.ecsv")
+    for data in (store, tmp_path / "table.ecsv"):
+        with refused("inverse_covariance", "biposh.filter"):
+            fit(data, table)
