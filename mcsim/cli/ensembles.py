@@ -70,7 +70,7 @@ def info(
     print(describe.describe(store))
     if export is not None:
         with opening.open_summary(store) as summary:
-            tables.write(summary.load(), export)
+            tables.write(opening.read_in(summary, store), export)
         print(f"wrote {export}")
 
 

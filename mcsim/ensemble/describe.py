@@ -40,8 +40,10 @@ def describe(path: str | Path) -> str:
         f"  made with {', '.join(f'{name} {number}' for name, number in attributes['packages'].items())}",
     ]
     if (target / "summary").is_dir():
+        kind = "_difference" if paired else ""
+        names = [f"biposh{kind}_binned_{what}" for what in ("mean", "standard_error")]
         with opening.open_summary(target) as summary:
-            rows = list(strongest(summary, "_difference" if paired else "").head(5).itertuples())
+            rows = list(strongest(opening.read_in(summary[names], target), kind).head(5).itertuples())
         found += ["  strongest binned spectra (mean over error):"] if rows else []
         for row in rows:
             bounds = f"l = {row.bin_first}-{row.bin_last}"

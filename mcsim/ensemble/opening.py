@@ -33,6 +33,8 @@ def open_ensemble(path: str | Path) -> "xr.Dataset":
     ------
     InputError
         If there is no store at ``path``.
+    RunError
+        If files of finished realizations are missing, which zarr would read as NaN, or the store is damaged.
 
     Examples
     --------
@@ -65,6 +67,8 @@ def open_summary(path: str | Path) -> "xr.Dataset":
     ------
     InputError
         If there is no store at ``path``, or it has no summary yet.
+    RunError
+        If files of the summary are missing or damaged.
 
     Examples
     --------
@@ -88,10 +92,17 @@ def _opened(path: Path, group: str | None) -> "xr.Dataset":
     """Open a group lazily; load its coordinates and ``done``, by which xarray selects rows."""
     import xarray as xr  # here: workers start sooner without it
 
+    store.check_whole(path, summary=group is not None)
     with store.faults_named(path):
         found = xr.open_zarr(path, group=group)
-        found[[*({*found.coords, "done"} & {*found.variables})]].load()
-        return found
+    read_in(found[[*({*found.coords, "done"} & {*found.variables})]], path)
+    return found
+
+
+def read_in(dataset: "xr.Dataset", path: str | Path) -> "xr.Dataset":
+    """Read the values of what was opened lazily of the store at ``path``; RunError if its files are damaged."""
+    with store.faults_named(Path(path)):
+        return dataset.load()
 
 
 def layout(path: Path, realizations: int) -> Layout:

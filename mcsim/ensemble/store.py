@@ -151,19 +151,32 @@ def discard(path: Path, damage: Damage) -> None:
             (path / name / key).unlink(missing_ok=True)
 
 
-def absent_files(path: Path) -> list[str]:
-    """Return the files of finished realizations, coordinates and summary that are not there; read none of them."""
+def absent_files(path: Path, summary: bool | None = None) -> list[str]:
+    """Return the files of finished realizations, coordinates and summary that are not there; read none of them.
+
+    ``summary``: True for those of the summary alone, False for all others.
+    """
     with faults_named(path):
         finished, wanted = done(path), []
         for name, metadata in _remembered(path).items():
+            if summary not in (None, name.split("/")[0] == "summary"):
+                continue
             wanted.append(f"{name}/zarr.json")
             if (shape := getattr(metadata, "shape", None)) is None:
                 continue  # a group
-            long = metadata.chunk_grid.chunk_shape[0] if shape else 1
-            for row in range(0, shape[0] if shape else 1, long):
-                if not _over_realizations(metadata) or name == "realization" or finished[row : row + long].any():
-                    wanted.append(f"{name}/{metadata.encode_chunk_key((row // long, 0, 0, 0, 0)[: len(shape)])}")
+            by_row = _over_realizations(metadata) and name != "realization"
+            long = metadata.chunk_grid.chunk_shape[0] if by_row else 0
+            for index in metadata.chunk_grid.all_chunk_coords(shape):
+                if not by_row or finished[index[0] * long : (index[0] + 1) * long].any():
+                    wanted.append(f"{name}/{metadata.encode_chunk_key(index)}")
     return [file for file in wanted if not (path / file).is_file()]
+
+
+def check_whole(path: Path, summary: bool | None = None) -> None:
+    """Raise RunError if there are :func:`absent_files`: zarr reads them as fill values, without a word."""
+    if absent := absent_files(path, summary):
+        some = f"{len(absent)} of its files, {absent[0]} among them"
+        raise RunError(f"{path} lacks {some}; mcsim run --resume makes them again.")
 
 
 def broken_parts(path: Path) -> dict[str, str]:
@@ -252,11 +265,17 @@ def write_summary(path: Path, summary: "xr.Dataset") -> None:
     """Replace the summary group."""
     with faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         form: Any = {"zarr_format": 3, "write_empty_chunks": True, "consolidated": False}
-        encoding = dict.fromkeys(summary.variables, _CODECS)
+        encoding = {name: _CODECS | _absent_value(array.dtype) for name, array in summary.variables.items()}
         write_dataset(summary, Path(scratch) / "summary", encoding=encoding, **form)
         shutil.rmtree(path / "summary", ignore_errors=True)
         os.replace(Path(scratch) / "summary", path / "summary")
         _consolidate(path)
+
+
+def _absent_value(dtype: np.dtype) -> dict[str, Any]:
+    """Return what stands for numbers whose file is missing, if zarr would take zero; xarray sees to real numbers."""
+    values: dict[str, complex] = {"c": complex(np.nan, np.nan), "i": -1}
+    return {"fill_value": values[dtype.kind]} if dtype.kind in values else {}
 
 
 def write_dataset(dataset: "xr.Dataset", folder: Path, **form: Any) -> None:

@@ -37,7 +37,7 @@ def ensemble_figure(
         label = pairs[0] if pair is None else pair
         if label not in pairs:
             raise InputError(f"There is no pair {label} in {path}; choose among {'; '.join(pairs)}.")
-        chosen = summary.sel(pair=label).load()
+        chosen = opening.read_in(summary.sel(pair=label), path)
     keep = np.ones(chosen.sizes["mode"], dtype=bool)
     wanted = {name: value for name, value in (("L", L), ("M", M), ("d", d)) if value is not None}
     for name, value in wanted.items():

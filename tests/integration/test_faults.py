@@ -16,16 +16,19 @@ from pathlib import Path
 from typing import Any
 
 import dask
+import numpy as np
 import pytest
+import xarray as xr
 from distributed import Client, KilledWorker, LocalCluster
 from distributed.comm.core import CommClosedError
 from distributed.diagnostics.plugin import WorkerPlugin
 from zarr.storage import _local
 
 from mcsim import cli, config
-from mcsim.ensemble import repair, runner, store, tasks
+from mcsim.ensemble import describe, opening, repair, runner, store, tables, tasks
 from mcsim.ensemble.runner import batch, cluster
 from mcsim.errors import RunError
+from mcsim.plot.spectra import ensemble_figure
 from mcsim.simulation import simulate
 from mcsim.support.progress import Journal
 from refusals import refused
@@ -114,6 +117,58 @@ def test_a_finished_store_that_lacks_files_is_not_finished(part: str, copy: Path
     (shutil.rmtree if (copy / part).is_dir() else os.remove)(copy / part)
     with refused(part, "--resume", by=RunError):
         runner.run(table(), copy)
+
+
+BINNED = "summary/biposh_difference_binned_mean/c/0/0/0"
+READERS = {
+    "summary": lambda path: opening.open_summary(path),
+    "info": lambda path: describe.describe(path),
+    "export": lambda path: tables.table(opening.read_in(opening.open_summary(path), path)),
+    "plot": lambda path: ensemble_figure(path),
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_summary_that_lacks_files_is_not_read_as_zeros(reader: str, copy: Path) -> None:
+    READERS[reader](copy)
+    remove(copy / BINNED)
+    with refused(BINNED, "--resume", by=RunError):
+        READERS[reader](copy)
+    assert opening.open_ensemble(copy).done.all()  # the realizations are there
+
+
+@pytest.mark.parametrize("reader", ["info", "export", "plot"])
+def test_a_damaged_summary_is_a_sentence(reader: str, copy: Path) -> None:
+    flip(copy / BINNED)
+    with refused(copy, "--verify", "--resume", by=RunError):
+        READERS[reader](copy)
+
+
+@pytest.mark.parametrize("part", ["biposh/c/1/0/0/0", "cl/c/0/0/0", "ell/c/0"])
+def test_finished_realizations_that_lack_files_are_not_opened_as_nan(part: str, copy: Path) -> None:
+    remove(copy / part)
+    with refused(part, "--resume", by=RunError):
+        opening.open_ensemble(copy)
+    assert int(opening.open_summary(copy)["count"]) == 10
+
+
+def test_absent_numbers_of_a_summary_are_none(copy: Path) -> None:
+    """Whoever opens a store without mcsim."""
+    for part in ("biposh_mean/c/0/0/0", "cl_mean/c/0/0", "count/c"):
+        remove(copy / "summary" / part)
+    with xr.open_zarr(copy, group="summary") as found:
+        assert np.isnan(found["biposh_mean"].values).all()
+        assert np.isnan(found["cl_mean"].values).all()
+        assert int(found["count"]) < 0
+
+
+def test_every_piece_of_a_large_summary_is_missed(copy: Path) -> None:
+    """Zarr cuts large arrays along all their dimensions."""
+    large = np.ones((2, 1500, 1500))
+    store.write_summary(copy, xr.Dataset({"large": (("pair", "mode", "bin"), large)}))
+    assert store.absent_files(copy) == []
+    remove(copy / "summary/large/c/1/2/1")
+    assert store.absent_files(copy) == ["summary/large/c/1/2/1"]
 
 
 def test_hash_that_is_not_that_of_the_configuration_is_named(small_store: Path, client: Client, copy: Path) -> None:

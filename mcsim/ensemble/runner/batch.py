@@ -101,9 +101,7 @@ def run(
     if resume and not exists:
         raise InputError(f"There is no store {target} to resume; leave out --resume to start it.")
     if exists and not resume and _finished(target, loaded, wanted):
-        if absent := store.absent_files(target):
-            some = f"{len(absent)} of its files, {absent[0]} among them"
-            raise RunError(f"{target} lacks {some}; mcsim run --resume makes them again.")
+        store.check_whole(target)
         return Result(target, int(store.done(target).sum()), 0, ())
     if exists:
         plan.check_same(target, loaded)
