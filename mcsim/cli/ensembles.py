@@ -89,10 +89,12 @@ def plot(
     from mcsim.ensemble import store as stores
     from mcsim.plot.spectra import ensemble_figure
 
+    if exact and predict is None:
+        raise InputError("--exact says how to predict, but no prediction is asked for; add --predict, or leave it out.")
     stores.attributes(store)
     target = picture(output, store)
     expected = None
-    if predict is not None and predict.endswith((".zarr", ".ecsv")):
+    if predict is not None and Path(predict).suffix in tables.ENDINGS:
         if exact:
             raise InputError(f"--exact says how to predict, but {predict} is predicted already; leave it out.")
         expected = tables.read_prediction(predict)

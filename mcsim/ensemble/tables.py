@@ -12,6 +12,8 @@ from astropy.table import Table
 from mcsim.errors import InputError
 from mcsim.support.folders import unreadable, unwritable, user_path, writable
 
+ENDINGS = (".zarr", ".nc", ".ecsv")  #: of files of summaries and predictions: Zarr, NetCDF, a table of bins
+
 
 def spectra(summary: xr.Dataset, kind: str) -> pd.DataFrame:
     """Return the bins of all spectra with L > 0: pair, mode, bin_first, bin_last, value and error in uK^2, sigma.
@@ -69,7 +71,7 @@ def table(summary: xr.Dataset) -> Table:
 def check_output(output: str | Path) -> None:
     """Raise InputError unless :func:`write` can write a file of this name, and knows the kind that it asks for."""
     ending = Path(output).suffix
-    if ending not in (".zarr", ".nc", ".ecsv"):
+    if ending not in ENDINGS:
         raise InputError(
             f"{output} ends in {ending or 'nothing'}; choose .zarr, .nc (NetCDF) or .ecsv (table of bins)."
         )
@@ -84,6 +86,7 @@ def write(summary: xr.Dataset, output: str | Path) -> None:
     check_output(output)
     target = user_path(output)
     with unwritable(target, "choose another file"):
+        target.parent.mkdir(parents=True, exist_ok=True)
         if target.suffix == ".zarr":
             with warnings.catch_warnings():
                 # Zarr warns that its consolidated metadata and strings are not yet standard.
@@ -123,11 +126,25 @@ def read_prediction(path: str | Path) -> xr.Dataset:
     if not source.exists():
         raise InputError(f"{source} does not exist; give what mcsim predict -o wrote, or a configuration.")
     with unreadable(source, "a prediction", "give what mcsim predict -o wrote"):
-        found = xr.open_zarr(source) if source.is_dir() else _from_table(source)
+        if source.is_dir():
+            found = xr.open_zarr(source).load()
+        else:
+            found = _from_netcdf(source) if source.suffix == ".nc" else _from_table(source)
         if "biposh_binned_mean" not in found:
             raise KeyError("biposh_binned_mean")
-        found = found.load()
+    if "prediction" not in found.attrs and ("count" in found or "realizations" in found.attrs):
+        raise InputError(f"{source} is the summary of a Monte Carlo, no prediction; give what mcsim predict -o wrote.")
     return found.assign_attrs(prediction=found.attrs.get("prediction", f"from {source.name}"))
+
+
+def _from_netcdf(path: Path) -> xr.Dataset:
+    """Read what :func:`_for_netcdf` made, with complex variables in one piece."""
+    with xr.open_dataset(path, engine="scipy") as parts:
+        found = parts.load()
+    for name in [str(name)[:-3] for name in found.data_vars if str(name).endswith("_re")]:
+        joined = found[f"{name}_re"] + 1j * found[f"{name}_im"]
+        found = found.drop_vars([f"{name}_re", f"{name}_im"]).assign({name: joined})
+    return found
 
 
 def _from_table(path: Path) -> xr.Dataset:

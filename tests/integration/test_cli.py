@@ -249,6 +249,7 @@ seed = 7
         (("info", ".", "--verify"), (" . ",)),
         (("plot", "."), (" . ",)),
         (("plot", ".", "--predict", "nothing.zarr"), (" . ",)),
+        (("plot", ".", "--exact"), ("--exact", "--predict")),
         (("merge", ".", ".", "-o", "x.zarr"), (" . ",)),
         (("fit", "nothing.zarr", "quickstart"), ("nothing.zarr",)),
         (("predict", "quickstart", "-o", "x.txt"), ("x.txt", ".ecsv")),
@@ -396,7 +397,7 @@ def test_version(mcsim: Command) -> None:
     assert out.split() == ["mcsim", version("mcsim")]
 
 
-@pytest.mark.parametrize("ending", ["zarr", "ecsv"])
+@pytest.mark.parametrize("ending", ["zarr", "nc", "ecsv"])
 def test_plot_reads_what_predict_wrote(ending: str, mcsim: Command, small_store: Path, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SMALL)
     assert mcsim("predict", "small.toml", "-o", f"expected.{ending}")[0] == 0
@@ -410,7 +411,8 @@ def test_plot_reads_what_predict_wrote(ending: str, mcsim: Command, small_store:
             np.testing.assert_allclose(found[name].values, expected[name].values, rtol=1e-12, atol=1e-12)
     for name in ("L", "M", "d", "parity", "bin", "bin_first", "bin_last"):
         assert found[name].values.tolist() == expected[name].values.tolist()
-    code, _, err = mcsim("plot", small_store, "--L", 2, "--predict", f"expected.{ending}", "-o", "both.png")
+    slash = "/" if ending == "zarr" else ""  # as a shell completes the name of a folder
+    code, _, err = mcsim("plot", small_store, "--L", 2, "--predict", f"expected.{ending}{slash}", "-o", "both.png")
     assert (code, err) == (0, "")
     assert (tmp_path / "both.png").stat().st_size > 10_000
     assert_refused(mcsim("plot", small_store, "--predict", f"expected.{ending}", "--exact"), "--exact")
@@ -422,6 +424,17 @@ def test_a_file_that_is_no_prediction_is_refused(name: str, mcsim: Command, smal
     (tmp_path / "text.ecsv").write_text("no table")
     Table({"L": [2], "value": [1.0]}).write(tmp_path / "columns.ecsv", format="ascii.ecsv")
     assert_refused(mcsim("plot", small_store, "--predict", name, "-o", "x.png"), name)
+    assert not (tmp_path / "x.png").exists()
+
+
+@pytest.mark.parametrize("ending", tables.ENDINGS)
+def test_summary_is_exported_into_a_new_folder_and_no_prediction(
+    ending: str, mcsim: Command, small_store: Path, tmp_path: Path
+) -> None:
+    file = f"new/folder/summary{ending}"
+    assert mcsim("info", small_store, "--export", file)[0] == 0
+    assert (tmp_path / file).exists()
+    assert_refused(mcsim("plot", small_store, "--predict", file, "-o", "x.png"), file)
     assert not (tmp_path / "x.png").exists()
 
 
