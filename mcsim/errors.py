@@ -24,6 +24,8 @@ class InputError(ValueError):
     refused: True
     """
 
+    stands_in: str | None = None  #: key of the table of a run that it is about, once the message says it
+
     def __init__(self, message: str) -> None:
         """Make one line of what a library said of a broken file; name what was given as an array, not its file."""
         super().__init__(_GIVEN.sub(r"the given \1", " ".join(message.split()) if "\n" in message else message))

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from mcsim.config import arrays, paths
 from mcsim.config.consistency import warn_of_units
-from mcsim.config.messages import sentence, shown
+from mcsim.config.messages import read_from, sentence, shown
 from mcsim.config.preparation import grid_after
 from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 from mcsim.errors import InputError
@@ -73,18 +73,18 @@ def load(source: str | Path | Mapping[str, Any] | RunConfig, base: str | Path | 
     if isinstance(source, RunConfig):
         return source
     if isinstance(source, Mapping):
-        where, folder = "configuration", user_path(base or ".")
+        where, file, folder = "configuration", None, user_path(base or ".")
         plain = _plain(arrays.in_files(source), where)
     else:
         path = user_path(source)
-        where = str(source)
+        where = file = str(source)
         plain, folder = _read(path if os.path.isfile(path) else resources.workflow(source))
     paths.make_absolute(plain, folder, where)
     paths.find_descriptions(plain)
     config = _validate(plain, where)
     paths.check_files(config, plain, where)
     warn_of_units(config)
-    return config
+    return config if file is None else read_from(config, file)
 
 
 def check_skies(config: RunConfig, realizations: range) -> None:

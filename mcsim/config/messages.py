@@ -2,7 +2,8 @@
 
 import difflib
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from typing import Any
 
@@ -10,6 +11,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from mcsim.config import beams, noise, preparation, schema
+from mcsim.errors import InputError
 
 # Table -> its class. The kind of a beam or scan, which pydantic puts into the location, selects one of several.
 _TABLES: dict[tuple[str, ...], type] = {
@@ -57,6 +59,7 @@ _BOUNDS = {
     "less_than_equal": ("le", "is too large", "at most"),
 }
 
+_FILE = "_file"  #: attribute of a run that was read from a file, beside its fields
 
 _TYPES = ("float", "int", "str", "bool")
 
@@ -67,6 +70,29 @@ def sentence(error: ValidationError, plain: Any, where: str) -> str:
     first = next((item for item in details if item["type"] == "unexpected_keyword_argument"), details[0])
     key, tables = _locate(first["loc"], plain)
     return f"{where}: {_text(first, key, tables)}."
+
+
+def read_from(run: schema.RunConfig, file: str) -> schema.RunConfig:
+    """Return a run that remembers its file for :func:`standing`: it is no part of the run, and no copy has it."""
+    object.__setattr__(run, _FILE, file)
+    return run
+
+
+@contextmanager
+def standing(run: schema.RunConfig, key: str) -> Iterator[None]:
+    """Say where it stands in the run what an InputError is about: file, if it was read from one, and key.
+
+    What has been said within is not said again.
+    """
+    try:
+        yield
+    except InputError as error:
+        if error.stands_in is not None:
+            raise
+        file = getattr(run, _FILE, None)
+        said = type(error)(f"{key}: {error}" if file is None else f"{file}: {key}: {error}")
+        said.stands_in = key
+        raise said from error
 
 
 def _text(item: ErrorDetails, key: str, tables: tuple[str, ...]) -> str:

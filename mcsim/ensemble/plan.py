@@ -17,7 +17,7 @@ from mcsim.errors import InputError
 from mcsim.instrument.scan import read_moments
 from mcsim.instrument.scan.accumulate import SECONDS_PER_SAMPLE
 from mcsim.simulation import differencing, noise, offsets, skies
-from mcsim.simulation.channels import check_effects, check_scans, load_beam, refuse_external, scan_model
+from mcsim.simulation.channels import check_beams, check_effects, check_scans, load_beam, refuse_external, scan_model
 from mcsim.simulation.filtering import Bands, probes_of
 from mcsim.simulation.preparation import preparation
 from mcsim.simulation.survey import Survey
@@ -174,6 +174,7 @@ def describe(source: str | Path, part: slice | None = None, workers: int | None 
     """Return a text on the cost of a run: realizations, tasks, memory, disk, files and time."""
     run = config.load(source)
     refuse_external(run)
+    check_beams(run)
     check_scans(run)
     check_effects(run)
     _check_files(run)

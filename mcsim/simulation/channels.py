@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 
@@ -9,6 +10,7 @@ import healpy
 import numpy as np
 
 from mcsim import config, systematics
+from mcsim.config.messages import standing
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
 from mcsim.instrument.scan.offsets import HIGHEST
@@ -86,9 +88,12 @@ def effects_on(
     all, or the other way round.
     """
     acting = []
-    for entry in run.effects:
-        effect = systematics.build(entry.name, entry.parameters, library)
-        check_scope(f"effect {entry.name}", type(effect), entry.channel, run)
+    for number, entry in enumerate(run.effects):
+        with standing(run, f"effect[{number}]"):
+            kind = systematics.get(entry.name, library)
+            beside = ("name", "channel") if kind.scope == "channel" else ("name",)
+            effect = systematics.build(kind, entry.parameters, beside=beside)
+            check_scope(f"effect {entry.name}", kind, entry.channel, run)
         if "amplitude" not in entry.parameters:
             warnings.warn(f"effect {entry.name} has no amplitude, so that it does nothing; give one.", stacklevel=2)
         if entry.channel in (None, channel):
@@ -120,26 +125,33 @@ def refuse_external(run: config.RunConfig) -> None:
         )
 
 
+def in_channel(run: config.RunConfig, spec: config.Channel) -> AbstractContextManager[None]:
+    """Say of an InputError that it is about this channel of a run."""
+    return standing(run, f"channel[{spec.name}]")
+
+
 def check_beams(run: config.RunConfig) -> None:
     """Refuse a run with a beam in closed form that cannot be computed, as the run would."""
     for channel in run.channels:
         for beam in (channel.beam, channel.beam_b):
             if isinstance(beam, config.BeamGaussian | config.BeamEllipticalGaussian):
-                _beam(channel.name, beam, run.sky.lmax)
+                with in_channel(run, channel):
+                    _beam(channel.name, beam, run.sky.lmax)
 
 
 def check_scans(run: config.RunConfig) -> None:
     """Refuse a run whose scan models cannot be read, or lack what a channel names, as the run would."""
     for spec in run.channels:
-        match spec.scan:
-            case config.ScanHitAveraged():
-                for split in run.map.each_split:
-                    scan_model(spec, spec.scan, split).select()
-            case config.ScanDifferencing():
-                for split in run.map.each_split:
-                    scan_model(spec, spec.scan, split).pair(spec.scan.pair)
-            case config.ScanMoments():
-                described(spec)
+        with in_channel(run, spec):
+            match spec.scan:
+                case config.ScanHitAveraged():
+                    for split in run.map.each_split:
+                        scan_model(spec, spec.scan, split).select()
+                case config.ScanDifferencing():
+                    for split in run.map.each_split:
+                        scan_model(spec, spec.scan, split).pair(spec.scan.pair)
+                case config.ScanMoments():
+                    described(spec)
 
 
 def check_effects(run: config.RunConfig) -> None:
@@ -148,11 +160,12 @@ def check_effects(run: config.RunConfig) -> None:
         acting = effects_on(run, spec.name)
         if not acting:
             continue
-        if run.map.grid == "gl":
-            refuse_pixel_effects(spec.name, acting)
-        if isinstance(spec.scan, config.ScanDifferencing):
-            refuse_excess(spec.name, acting)
-        systematics.tried(acting, site_of(run, spec))
+        with in_channel(run, spec):
+            if run.map.grid == "gl":
+                refuse_pixel_effects(spec.name, acting)
+            if isinstance(spec.scan, config.ScanDifferencing):
+                refuse_excess(spec.name, acting)
+            systematics.tried(acting, site_of(run, spec))
 
 
 def refuse_excess(channel: str, acting: tuple[systematics.Effect, ...]) -> None:

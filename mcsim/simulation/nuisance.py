@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mcsim import config, systematics
+from mcsim.config.messages import standing
 from mcsim.errors import InputError
 from mcsim.simulation import convolve
 from mcsim.simulation.channels import check_scope, site_of, table_of
@@ -105,14 +106,17 @@ def nuisances_of(run: config.RunConfig, library: Library | None = None) -> tuple
     ``library``: default: the catalogue. Raise InputError for an effect or a parameter that is not known, a channel that
     is missing or superfluous, another number of widths than the effect has components, and a second table of one.
     """
-    found = tuple(_nuisance(run, entry, library) for entry in run.nuisances)
-    for number, one in enumerate(found):
-        if any((one.effect, one.channel, one.settings) == (e.effect, e.channel, e.settings) for e in found[:number]):
-            where = "" if one.channel is None else f" of {one.channel}"
-            raise InputError(
-                f"nuisance {one.effect.name}{where} is declared twice; keep one table, with its own width."
-            )
-    return found
+    found: list[Nuisance] = []
+    for number, entry in enumerate(run.nuisances):
+        with standing(run, f"nuisance[{number}]"):
+            one = _nuisance(run, entry, library)
+            if any((one.effect, one.channel, one.settings) == (e.effect, e.channel, e.settings) for e in found):
+                where = "" if one.channel is None else f" of {one.channel}"
+                raise InputError(
+                    f"nuisance {one.effect.name}{where} is declared twice; keep one table, with its own width."
+                )
+        found.append(one)
+    return tuple(found)
 
 
 def _nuisance(run: config.RunConfig, entry: config.Nuisance, library: Library | None) -> Nuisance:
@@ -143,17 +147,24 @@ def check_nuisances(run: config.RunConfig, library: Library | None = None) -> in
     Raise InputError for one that is not known, or that four prior widths make impossible.
     """
     orders = 0
-    for one in nuisances_of(run, library):
-        try:
-            for effect, spec in product(one.extremes(), run.channels):
-                if one.channel in (None, spec.name):
-                    orders = max(orders, tried((effect,), site_of(run, spec)).mmax)
-        except InputError as error:
-            text = str(error).rstrip(".")
-            raise InputError(
-                f"nuisance {one.effect.name}: draws reach {REACH:g} prior widths, and there {text}; lower the width or "
-                "remove the nuisance."
-            ) from None
+    for number, one in enumerate(nuisances_of(run, library)):
+        with standing(run, f"nuisance[{number}]"):
+            orders = max(orders, _orders_at_most(run, one))
+    return orders
+
+
+def _orders_at_most(run: config.RunConfig, one: Nuisance) -> int:
+    orders = 0
+    try:
+        for effect, spec in product(one.extremes(), run.channels):
+            if one.channel in (None, spec.name):
+                orders = max(orders, tried((effect,), site_of(run, spec)).mmax)
+    except InputError as error:
+        text = str(error).rstrip(".")
+        raise InputError(
+            f"nuisance {one.effect.name}: draws reach {REACH:g} prior widths, and there {text}; lower the width or "
+            "remove the nuisance."
+        ) from None
     return orders
 
 

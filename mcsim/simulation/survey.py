@@ -16,6 +16,7 @@ from mcsim.instrument.scan import MapGrid
 from mcsim.simulation import convolve, mapmaking
 from mcsim.simulation.channels import (
     effects_on,
+    in_channel,
     refuse_excess,
     refuse_external,
     refuse_pixel_effects,
@@ -187,7 +188,11 @@ def survey(
     check_whole(nthreads, "nthreads", 1)
     refuse_external(run)
     cl = None if run.sky.spectrum is None else spectra.load(run.sky.spectrum, run.sky.lmax)
-    made = tuple(_channel(run, channel, nthreads, progress, orders, library) for channel in run.channels)
+    each = []
+    for spec in run.channels:
+        with in_channel(run, spec):
+            each.append(_channel(run, spec, nthreads, progress, orders, library))
+    made = tuple(each)
     channels = (
         tuple(_prepared(run, *each) for each in zip(run.channels, made, strict=True)) if run.preparation else made
     )

@@ -165,35 +165,45 @@ def in_file(path: str) -> tuple[type[Effect], ...]:
     return found
 
 
-def build(kind: str | type[Effect], parameters: Mapping[str, Any], library: Library | None = None) -> Effect:
+def build(
+    kind: str | type[Effect],
+    parameters: Mapping[str, Any],
+    library: Library | None = None,
+    beside: tuple[str, ...] = (),
+) -> Effect:
     """Build an effect, or the one of that name, from a table of parameters; those left out have their defaults.
 
-    Raise InputError for an unknown name, a parameter that the effect does not have, or a value that is no finite number
-    where one is needed.
+    ``beside``: keys that stand beside them in such a table. Raise InputError for an unknown name, a parameter that the
+    effect does not have, or a value that is no finite number where one is needed.
     """
     kind = get(kind, library) if isinstance(kind, str) else kind
     known = [f.name for f in fields(kind)]
     values: dict[str, Any] = {}
     for key, value in parameters.items():
         if key not in known:
-            raise InputError(f"effect {kind.name} has no parameter {key!r}; it has {', '.join(known)}.")
+            near = difflib.get_close_matches(key, (*beside, *known), n=1)
+            hint = f" (did you mean {near[0]}?)" if near else ""
+            raise InputError(
+                f"effect {kind.name} has no parameter {key!r}{hint}; it has {', '.join((*beside, *known))}."
+            )
         values[key] = _checked(f"effect {kind.name}: {key}", value, getattr(kind(), key))
     return kind(**values)
 
 
 def _checked(what: str, value: Any, default: Any) -> Any:
     """Return a value of the type of the default."""
+    shown = list(value) if isinstance(value, tuple) else value  # as TOML has it
     if isinstance(default, str):
         if isinstance(value, str):
             return value
-        raise InputError(f"{what} = {value!r} must be a text.")
+        raise InputError(f"{what} = {shown!r} must be a text.")
     if isinstance(default, tuple):
         if isinstance(value, list | tuple) and (not default or len(value) == len(default)):
             return tuple(float(_checked(what, item, 0.0)) for item in value)
         size = f"{len(default)} numbers" if default else "numbers"
-        raise InputError(f"{what} = {value!r} must be a list of {size}.")
+        raise InputError(f"{what} = {shown!r} must be a list of {size}.")
     if isinstance(value, bool) or not isinstance(value, Real) or not isfinite(value):
-        raise InputError(f"{what} = {value!r} must be a finite number.")
+        raise InputError(f"{what} = {shown!r} must be a finite number.")
     number = float(value)
     if what.endswith(": lat_deg") and abs(number) > 90.0:
         raise InputError(f"{what} = {value!r} is no latitude; give -90 to 90, and the longitude as lon_deg.")

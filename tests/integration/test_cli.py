@@ -443,6 +443,10 @@ def test_summary_is_exported_into_a_new_folder_and_no_prediction(
     [
         ('[[effects]]\nname = "gain_drift"', "[[effect]]"),
         ('[[effect]]\nname = "gain_drit"', "gain_drift"),
+        ('[[effect]]\nname = "boost"\namplitude = 0.0\n[[effect]]\nname = "gain_drit"', "effect[1]"),
+        ('[[effect]]\nname = "gain_drift"\nchanel = "W1"', "channel"),
+        ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\namplitude = [1.0, 2.0]', "[1.0, 2.0]"),
+        ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\namplitude = 0.3', "channel[W1]"),
         ('[[effect]]\nname = "gain_drift"', "channel"),
         ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\nphase = 3.0', "phase"),
         ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\namplitude = "large"', "amplitude"),
@@ -464,12 +468,12 @@ def test_config_refuses_a_beam_that_run_refuses(mcsim: Command, tmp_path: Path) 
 
 
 def refused_by_config_and_run(mcsim: Command, key: str) -> None:
-    """Check that ``config``, ``run`` and ``run --dry-run`` refuse small.toml with one sentence that names the key."""
+    """Check that ``config``, ``run`` and ``run --dry-run`` refuse small.toml with one sentence, by file and key."""
     answers = [
         mcsim(*words) for words in (("config", "small.toml"), ("run", "small.toml"), ("run", "small.toml", "--dry-run"))
     ]
     for answer in answers:
-        assert_refused(answer, key)
+        assert_refused(answer, "small.toml", key)
     assert len({err for _, _, err in answers}) == 1
 
 
@@ -479,6 +483,7 @@ def refused_by_config_and_run(mcsim: Command, key: str) -> None:
         ('{ kind = "hit_averaged", model = "mine.toml" }', "spin_speed"),
         ('{ kind = "hit_averaged", model = "wmap", line_of_sight = "left" }', "left"),
         ('{ kind = "differencing", model = "wmap_focal_plane", pair = "W9" }', "W9"),
+        ('{ kind = "hit_averaged", model = "wmap", sample_period_s = 1e9 }', "channel[W1]"),
     ],
 )
 def test_config_refuses_scans_that_run_refuses(scan: str, key: str, mcsim: Command, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from mcsim import Beam, Moments, config, systematics
 from mcsim.beamfit.effective_beam import fit_models
 from mcsim.errors import InputError
 from mcsim.simulation.channels import check_effects
+from mcsim.simulation.nuisance import check_nuisances
 from refusals import refused
 
 LMAX, NSIDE = 12, 8
@@ -225,6 +226,24 @@ def test_arguments_of_another_kind_are_named(wrong, named) -> None:
 def test_an_effect_without_amplitude_is_warned_of() -> None:
     with pytest.warns(UserWarning, match="calibration has no amplitude"):
         check_effects(mcsim.load_config(run(effect=[{"name": "calibration", "channel": "W"}])))
+
+
+@pytest.mark.parametrize(
+    ("table", "named"),
+    [
+        ({"effect": [{"name": "calibraton", "channel": "W"}]}, ("effect[0]", "calibration")),
+        ({"effect": [{"name": "calibration", "chanel": "W"}]}, ("effect[0]", "'chanel'", "channel")),
+        ({"nuisance": [{"effect": "calibraton", "channel": "W", "width": 0.1}]}, ("nuisance[0]", "calibration")),
+        ({"nuisance": [{"effect": "calibration", "channel": "W", "width": 0.1}] * 2}, ("nuisance[1]", "calibration")),
+        ({"nuisance": [{"effect": "beam_width", "channel": "W", "width": 0.9}]}, ("nuisance[0]", "beam_width")),
+    ],
+)
+def test_tables_that_a_dict_lists_are_named_by_their_keys(table, named) -> None:
+    model = mcsim.load_config(run(**table))
+    with refused(*named) as caught:
+        check_effects(model)
+        check_nuisances(model)
+    assert str(caught.value).startswith(named[0])
 
 
 def test_variances_in_k2_are_no_noise() -> None:
