@@ -4,6 +4,7 @@ Arrays have the dimensions (realization, pair, mode, ell) and are chunked along 
 chunks, ``done`` last. A realization exists only if ``done`` is True.
 """
 
+import asyncio
 import os
 import shutil
 import tempfile
@@ -19,6 +20,7 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import ZstdCodec
 from zarr.core.buffer import Buffer
+from zarr.core.sync import sync
 from zarr.storage import MemoryStore
 
 from mcsim.ensemble.layout import Layout, listed
@@ -36,6 +38,7 @@ _WHOLE: dict[str, Any] = {"config": {"write_empty_chunks": True}, **_CODECS}
 MAP, FORMER_MAP = "observed_map", "map"
 """Name of kept maps, and their name in older stores, which hides an xarray method."""
 
+SETTLING_S = 5.0
 _FAULTS = (OSError, KeyError, ValueError, RuntimeError, TypeError)
 
 
@@ -368,11 +371,18 @@ def faults_named(path: Path) -> Iterator[None]:
     except (RunError, InputError):
         raise
     except _FAULTS as error:
+        sync(_others_ended())
         remedy = "repair its disk" if isinstance(error, OSError) else "mcsim info --verify says what is damaged"
         raise RunError(
             f"The store {path} cannot be used ({type(error).__name__}: {_reason(error)}); {remedy}, and mcsim run "
             "--resume goes on."
         ) from error
+
+
+async def _others_ended() -> None:
+    """Let the reads end that zarr began beside one that failed: those that are left complain when Python ends."""
+    if others := asyncio.all_tasks() - {asyncio.current_task()}:
+        await asyncio.wait(others, timeout=SETTLING_S)
 
 
 def refuse_unwritable(path: Path) -> AbstractContextManager[None]:

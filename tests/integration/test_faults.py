@@ -1,5 +1,6 @@
 """Damage to a store, realizations and workers that fail every time, kills at awkward moments: nothing is lost."""
 
+import asyncio
 import errno
 import json
 import os
@@ -10,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -22,6 +24,7 @@ import xarray as xr
 from distributed import Client, KilledWorker, LocalCluster
 from distributed.comm.core import CommClosedError
 from distributed.diagnostics.plugin import WorkerPlugin
+from zarr.core import sync
 from zarr.storage import _local
 
 from mcsim import cli, config
@@ -169,6 +172,27 @@ def test_every_piece_of_a_large_summary_is_missed(copy: Path) -> None:
     assert store.absent_files(copy) == []
     remove(copy / "summary/large/c/1/2/1")
     assert store.absent_files(copy) == ["summary/large/c/1/2/1"]
+
+
+def test_a_read_that_fails_leaves_none_behind(copy: Path) -> None:
+    """Zarr begins many reads at once; one that is left complains when Python ends."""
+    layout = replace(opening.layout(copy, 256), chunk=1)
+    many = copy.with_name("many.zarr")
+    store.create(many, layout, store.attributes(copy))
+    store.write(many, 0, {}, np.ones(256, dtype=bool))
+    truncate(many / "done/c/0")
+    with refused(many, "--resume", by=RunError):
+        store.done(many)
+    assert asyncio.all_tasks(sync._get_loop()) == set()
+
+
+@pytest.mark.parametrize("address", ["nonsense", "xyz://127.0.0.1:1"])
+def test_an_address_of_no_scheduler_is_a_sentence_to_the_end_of_python(address: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mcsim", "run", "tiny", "-o", tmp_path / "x.zarr", "--scheduler", address]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert found.returncode == 2
+    assert found.stderr.splitlines()[-1].startswith("mcsim: ")
+    assert "Traceback" not in found.stderr
 
 
 def test_hash_that_is_not_that_of_the_configuration_is_named(small_store: Path, client: Client, copy: Path) -> None:

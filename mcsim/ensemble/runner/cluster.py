@@ -200,12 +200,27 @@ def connected(workers: Workers) -> Iterator[Client]:
         yield client
 
 
+class _Remote(Client):
+    """A client that closes itself if it cannot start for whatever reason: distributed does so for some only.
+
+    What it leaves open ends in a traceback when Python ends.
+    """
+
+    def start(self, **settings: Any) -> None:
+        """Connect to the scheduler."""
+        try:
+            super().start(**settings)
+        except Exception:
+            self.close()
+            raise
+
+
 @contextmanager
 def remote_client(scheduler: str) -> Iterator[Client]:
     """Yield the client of a running scheduler, whose workers have the driver's packages."""
     try:
         # No default client: one that fails would leave Dask without a scheduler for the rest of the session.
-        client = Client(scheduler, timeout=ANSWER_S, set_as_default=False)
+        client = _Remote(scheduler, timeout=ANSWER_S, set_as_default=False)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         certificates = "certificates that Dask's configuration names in distributed.comm.tls"
         if scheduler.startswith("tls://") and isinstance(error, TypeError):  # from a call without an ssl_context
