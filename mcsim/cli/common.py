@@ -73,6 +73,10 @@ Part = Annotated[str | None, Option(metavar="A:B", help="Only realizations A to 
 Png = Annotated[Path | None, Option("-o", "--output", metavar="PNG", help="Default: beside what it shows.")]
 
 
+PICTURES = (".png", ".pdf", ".svg", ".eps", ".ps", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
+"""Ends of the names of pictures; matplotlib would add .png to a name without one."""
+
+
 def chosen(workers: int | None, scheduler: str | None) -> int | str | None:
     """Return the number of processes or the address of the scheduler that was asked for; None: neither."""
     if workers is not None and scheduler is not None:
@@ -83,9 +87,11 @@ def chosen(workers: int | None, scheduler: str | None) -> int | str | None:
 def picture(asked: Path | None, shown: str | Path, end: str = "") -> Path:
     """Return the path of a picture: the one asked for, or a name with ``end`` beside the file or folder it shows.
 
-    The picture of something packaged comes into the working folder. Raise InputError if the folder cannot be written
-    into: that is said before anything is computed.
+    The picture of something packaged comes into the working folder. Raise InputError for a kind of picture that is not
+    known, or if the folder cannot be written into: that is said before anything is computed.
     """
+    if asked is not None and asked.suffix.lower() not in PICTURES:
+        raise InputError(f"{asked} ends in {asked.suffix or 'nothing'}; choose one of {', '.join(PICTURES)}.")
     source = user_path(shown)
     folder = source.absolute().parent if source.name in ("", "..") else source.parent
     target = folder / f"{source.absolute().stem}{end}.png" if asked is None else user_path(asked)

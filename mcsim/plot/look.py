@@ -36,7 +36,7 @@ def look_at_beams(
     ``source`` is a TOML configuration or packaged workflow (every channel is shown), or a file: a FITS image is a beam
     map, a FITS table holds b_lm or, in a single column, B_l, a text (.txt, .dat) B_l. ``lmax`` is by default 2048, or
     what the file holds or its pixels resolve, ``m_max`` chosen from the beam, and ``pixel_deg``, the side of a pixel of
-    a beam map in degrees, read from its header.
+    a beam map in degrees, read from its header. InputError for what the source does not have, or says itself.
     """
     path = Path(source)
     if path.is_dir() or (not path.exists() and path.suffix not in ("", ".toml")):
@@ -44,8 +44,7 @@ def look_at_beams(
         raise InputError(f"{path} {what}; give a beam map or b_lm (FITS), or a configuration.")
     if path.suffix == ".toml" or not path.exists():
         run = config.load(source)
-        if pixel_deg is not None:
-            raise InputError(f"{source} is a configuration, which says pixel_deg itself; leave out --pixel-deg.")
+        _refuse(f"{source} is a configuration, which says", "itself", m_max=m_max, pixel_deg=pixel_deg)
         for channel in run.channels:
             spec = channel.beam
             image = channels.load_beam_map(channel.name, spec) if isinstance(spec, config.BeamMap) else None
@@ -55,10 +54,19 @@ def look_at_beams(
         degree = min(LMAX, int(np.pi / image.pixel_rad)) if lmax is None else lmax
         yield _look_at(path.name, beams.Beam.from_map(image, degree, m_max), image)
     elif path.suffix in (".txt", ".dat") or beams.holds_window(path):
-        window = beams.read_window(path)
+        _refuse(f"{source} holds B_l of a circular beam, which has no", "", m_max=m_max or None, pixel_deg=pixel_deg)
+        window = beams.read_window(path, lmax)
         yield _look_at(path.name, beams.Beam.from_window(window, min(lmax or LMAX, window.size - 1)), None)
     else:
+        _refuse(f"{source} holds b_lm, which have no", "", pixel_deg=pixel_deg)
         yield _look_at(path.name, beams.Beam.from_blm(path, lmax, m_max), None)
+
+
+def _refuse(why: str, end: str, **options: float | None) -> None:
+    """Raise InputError for an option that is given and would change nothing."""
+    for name, value in options.items():
+        if value is not None:
+            raise InputError(f"{' '.join(filter(None, (why, name, end)))}; leave out --{name.replace('_', '-')}.")
 
 
 def _look_at(name: str, shown: beams.Beam, image: beams.BeamMap | None) -> Look:

@@ -96,8 +96,17 @@ def test_its_contents_are_in_the_hash(tmp_path):
 
 
 def test_a_text_of_a_window_is_shown(tmp_path):
-    [look] = look_at_beams(wmap_text(tmp_path))
+    path = wmap_text(tmp_path)
+    [look] = look_at_beams(path)
     assert "ampl_bl_W1.txt" in look.text
+    assert [one.text for one in look_at_beams(path, LMAX, m_max=0)] == [look.text]
+    for asked, named in (
+        ({"lmax": LMAX + 1}, (LMAX, LMAX + 1)),
+        ({"m_max": 2}, ("--m-max",)),
+        ({"pixel_deg": 0.1}, ("--pixel-deg",)),
+    ):
+        with refused(path, *named):
+            list(look_at_beams(path, **asked))
 
 
 @pytest.mark.parametrize(
