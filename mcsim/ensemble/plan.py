@@ -126,6 +126,22 @@ def check_same(path: Path, run: config.RunConfig) -> None:
         )
 
 
+def check_summarised(path: Path, run: config.RunConfig) -> None:
+    """Raise InputError unless a store whose attributes are lost is of this configuration, as its summary says."""
+    theirs, own = store.origin(path), attributes(run)
+    kept = (store.keeps_maps(path), run.ensemble.keep_maps)
+    for key, before, after in (
+        ("hash", theirs["digest"], own["digest"]),
+        ("ensemble.keep_maps", *kept),
+        ("version of mcsim", *(a["packages"]["mcsim"] for a in (theirs, own))),
+    ):
+        if before != after:
+            raise InputError(
+                f"{path} has lost its attributes, and its summary is of another configuration ({key}: {before} -> "
+                f"{after}); give the one that it was made with."
+            )
+
+
 def check_mergeable(path: Path, first: Mapping[str, Any], other: Path, second: Mapping[str, Any]) -> None:
     """Raise InputError if stores have different configurations."""
     if changes := _changes(first, second):

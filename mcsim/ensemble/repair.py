@@ -86,10 +86,15 @@ def verify(path: str | Path, quiet: bool = True) -> Verdict:
 def mend(path: Path, layout: Layout, attributes: Mapping[str, Any], quiet: bool = True) -> Verdict:
     """Verify a store that no run writes to, and drop damaged parts, so that a run computes them again.
 
-    Broken metadata and coordinates are rebuilt from the ``layout`` and ``attributes`` of the store's configuration.
+    Broken metadata and coordinates, or lost attributes of the store itself, are rebuilt from the ``layout`` and
+    ``attributes`` of its configuration.
     """
     _sweep(path)
-    broken = broken_parts(path)
+    lost = {}
+    if store.headless(path):
+        store.restore_attributes(path, layout, {**attributes, **store.origin(path)})
+        lost = {"zarr.json": "the attributes of the store could not be read"}
+    broken = lost | broken_parts(path)
     if broken:
         store.restore(path, layout, {name: attributes[name] for name in ("science", "digest")})
     verdict = verify(path, quiet)

@@ -206,9 +206,8 @@ def restore(path: Path, layout: Layout, update: Mapping[str, Any]) -> None:
     """Write metadata and coordinates anew, as those of a new store of this layout; drop the summary."""
     with faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         shutil.rmtree(path / "summary", ignore_errors=True)
-        made = _remembered(path)["done"]
-        kept = FORMER_MAP if FORMER_MAP in _remembered(path) else MAP
-        layout = replace(layout, realizations=made.shape[0], chunk=made.chunk_grid.chunk_shape[0], kept_name=kept)
+        remembered = _remembered(path)
+        layout = _as_made(layout, remembered["done"], FORMER_MAP in remembered)
         fresh = Path(scratch) / "fresh"
         create(fresh, layout, {**attributes(path), **update})
         for file in sorted(fresh.rglob("*")):
@@ -216,6 +215,20 @@ def restore(path: Path, layout: Layout, update: Mapping[str, Any]) -> None:
             if file.is_file():
                 target.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(file, target)
+
+
+def restore_attributes(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
+    """Write the ``zarr.json`` of a :func:`headless` store anew: its attributes, and metadata of all but the summary."""
+    with faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
+        made = zarr.open_array(path / "done", mode="r").metadata
+        create(Path(scratch) / "fresh", _as_made(layout, made, (path / FORMER_MAP).is_dir()), attributes)
+        os.replace(Path(scratch) / "fresh" / "zarr.json", path / "zarr.json")
+
+
+def _as_made(layout: Layout, done: Any, former: bool) -> Layout:
+    """Return a layout with the length and chunks that the metadata of ``done`` have, and the name of kept maps."""
+    length, chunk = done.shape[0], done.chunk_grid.chunk_shape[0]
+    return replace(layout, realizations=length, chunk=chunk, kept_name=FORMER_MAP if former else MAP)
 
 
 def done(path: Path, start: int = 0, stop: int | None = None) -> NDArray[np.bool_]:
@@ -231,14 +244,43 @@ def size(path: Path) -> int:
 
 
 def attributes(path: Path) -> dict[str, Any]:
-    """Return the attributes of a store; raise InputError if there is none at ``path``."""
+    """Return the attributes of a store; raise InputError if there is none at ``path``, RunError if they are lost."""
+    if headless(path):
+        raise RunError(
+            f"The attributes of the store {path}, in its zarr.json, are lost; mcsim run --resume with its "
+            "configuration makes them again."
+        )
     try:
         found = dict(_open(path).attrs)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except _FAULTS as error:
         raise InputError(f"{path} is not an ensemble store; name the folder that mcsim run wrote.") from error
     if "science" not in found:
         raise InputError(f"{path} is a Zarr group but not an ensemble store; name the folder that mcsim run wrote.")
     return found
+
+
+def headless(path: Path) -> bool:
+    """Return True for a folder that has all of a store, and a summary, but no attributes that can be read."""
+    try:
+        rest = all((path / part / "zarr.json").is_file() for part in ("done", "biposh", "summary"))
+    except OSError:
+        return False
+    try:
+        return rest and "science" not in _open(path).attrs
+    except _FAULTS as error:
+        return not isinstance(error, PermissionError)
+
+
+def origin(path: Path) -> dict[str, Any]:
+    """Return the attributes that the summary of a store repeats: digest, conventions, packages."""
+    with faults_named(path):
+        found = dict(_open(path / "summary").attrs)
+        return {name: found[name] for name in ("digest", "conventions", "packages")}
+
+
+def keeps_maps(path: Path) -> bool:
+    """Return True if realizations have their maps."""
+    return any((path / name).is_dir() for name in (MAP, FORMER_MAP))
 
 
 def chunk(path: Path) -> int:
@@ -277,8 +319,9 @@ def write_summary(path: Path, summary: "xr.Dataset") -> None:
 
 def _absent_value(dtype: np.dtype) -> dict[str, Any]:
     """Return what stands for numbers whose file is missing, if zarr would take zero; xarray sees to real numbers."""
-    values: dict[str, complex] = {"c": complex(np.nan, np.nan), "i": -1}
-    return {"fill_value": values[dtype.kind]} if dtype.kind in values else {}
+    if dtype.kind == "i":
+        return {"fill_value": np.iinfo(dtype).min}
+    return {"fill_value": complex(np.nan, np.nan)} if dtype.kind == "c" else {}
 
 
 def write_dataset(dataset: "xr.Dataset", folder: Path, **form: Any) -> None:

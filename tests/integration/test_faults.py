@@ -36,7 +36,7 @@ from mcsim.simulation import simulate
 from mcsim.support.progress import Journal
 from refusals import refused
 
-from .conftest import table
+from .conftest import ensemble, table
 from .test_runner import assert_same
 
 
@@ -193,6 +193,25 @@ def test_an_address_of_no_scheduler_is_a_sentence_to_the_end_of_python(address: 
     assert found.returncode == 2
     assert found.stderr.splitlines()[-1].startswith("mcsim: ")
     assert "Traceback" not in found.stderr
+
+
+@pytest.mark.parametrize("harm", [truncate, remove, lambda file: file.write_text(file.read_text().replace("sci", "x"))])
+def test_attributes_of_a_store_are_made_again(
+    harm: Callable[[Path], None], small_store: Path, client: Client, copy: Path
+) -> None:
+    harm(copy / "zarr.json")
+    truncate(copy / "cl/c/1/0/0")
+    for look in (describe.describe, repair.verify, lambda path: runner.run(table(), path)):
+        with refused("zarr.json", copy, "--resume", by=RunError):
+            look(copy)
+    for other in (table(ensemble={"realizations": 10, "seed": 8}), table(**ensemble(10, keep_maps=True))):
+        with refused(copy):
+            runner.run(other, copy, resume=True, workers=client)
+    result = runner.run(table(), copy, resume=True, workers=client)
+    assert (result.finished, result.computed) == (10, 4)
+    assert_same(copy, small_store)
+    assert repair.verify(copy).intact
+    assert store.attributes(copy) == store.attributes(small_store)
 
 
 def test_hash_that_is_not_that_of_the_configuration_is_named(small_store: Path, client: Client, copy: Path) -> None:

@@ -104,7 +104,7 @@ def run(
         store.check_whole(target)
         return Result(target, int(store.done(target).sum()), 0, ())
     if exists:
-        plan.check_same(target, loaded)
+        (plan.check_summarised if resume and store.headless(target) else plan.check_same)(target, loaded)
     store.check_writable(target)
     config.check_skies(loaded, wanted)
     journal = Journal(target, quiet)
