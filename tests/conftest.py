@@ -64,6 +64,7 @@ FIRST = {
     "test_compare",
     "test_compare_sides",
     "test_controls",
+    "test_damage",
     "test_diagnosis",
     "test_faults",
     "test_foregrounds",

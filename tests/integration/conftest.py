@@ -1,6 +1,8 @@
 """A small run that takes a fraction of a second, and workers to run it with: in this process, or quick to start."""
 
-from collections.abc import Iterator
+import shutil
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -8,10 +10,14 @@ from typing import Any
 import dask
 import pytest
 from distributed import Client, LocalCluster
+from matplotlib.figure import Figure
 
-from mcsim import config
+from mcsim import cli, config
 from mcsim.ensemble import runner
 from mcsim.ensemble.runner import cluster
+from refusals import unnamed
+
+Command = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture(scope="session")
@@ -70,4 +76,69 @@ def short_store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Pat
     """Its first three realizations, to be copied and extended."""
     path = tmp_path_factory.mktemp("store") / "short.zarr"
     runner.run(config.load(table(**ensemble(3))), path, workers=client)
+    return path
+
+
+SMALL = """\
+schema = 1
+name = "small"
+[sky]
+spectrum = "wmap7"
+lmax = 32
+[map]
+nside = 16
+[[channel]]
+name = "W1"
+beam = { kind = "elliptical_gaussian", fwhm_major_arcmin = 300.0, fwhm_minor_arcmin = 250.0 }
+scan = { kind = "parallel_transport", psi0_deg = 20.0 }
+[biposh]
+L_max = 2
+summary_bin = 10
+[ensemble]
+realizations = 10
+seed = 7
+"""
+
+
+@pytest.fixture
+def mcsim(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Command:
+    """Run a command in an empty folder: exit code, standard output, standard error.
+
+    Its figures are saved small and without a layout engine, which draws them twice; unit tests draw them whole.
+    """
+    savefig = Figure.savefig
+
+    def quick(figure: Figure, path: Path) -> None:
+        figure.set_layout_engine(None)
+        savefig(figure, path, dpi=50)
+
+    monkeypatch.setattr(Figure, "savefig", quick)
+
+    def run(*words: object) -> tuple[int, str, str]:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["mcsim", *map(str, words)])
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return run
+
+
+def assert_refused(answer: tuple[int, str, str], *named: object) -> None:
+    """Hold that a command ended with exit code 2 and one sentence that names all of ``named``."""
+    code, _, err = answer
+    assert code == 2
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
+    assert unnamed(err, *named) == []
+
+
+@pytest.fixture
+def copy(small_store: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "copy.zarr"
+    shutil.copytree(small_store, path)
     return path

@@ -1,6 +1,5 @@
-"""The command line as a user meets it: outputs, exit codes, one sentence for bad input, nothing left behind."""
+"""The command line as a user meets it: outputs, exit codes, pictures and tables."""
 
-import errno
 import inspect
 import io
 import json
@@ -20,7 +19,6 @@ import xarray as xr
 import zarr
 from astropy.io import fits
 from astropy.table import Table
-from matplotlib.figure import Figure
 
 from mcsim import cli, config, open_summary
 from mcsim.ensemble import tables
@@ -29,46 +27,7 @@ from mcsim.ensemble.prediction import predict
 from mcsim.plot.spectra import ensemble_figure
 from refusals import unnamed
 
-from .conftest import table
-
-Command = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def mcsim(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Command:
-    """Run a command in an empty folder: exit code, standard output, standard error.
-
-    Its figures are saved small and without a layout engine, which draws them twice; unit tests draw them whole.
-    """
-    savefig = Figure.savefig
-
-    def quick(figure: Figure, path: Path) -> None:
-        figure.set_layout_engine(None)
-        savefig(figure, path, dpi=50)
-
-    monkeypatch.setattr(Figure, "savefig", quick)
-
-    def run(*words: object) -> tuple[int, str, str]:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["mcsim", *map(str, words)])
-        code = 0
-        try:
-            cli.main()
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return run
-
-
-def assert_refused(answer: tuple[int, str, str], *named: object) -> None:
-    """Hold that a command ended with exit code 2 and one sentence that names all of ``named``."""
-    code, _, err = answer
-    assert code == 2
-    assert err.count("\n") == 1
-    assert "Traceback" not in err
-    assert unnamed(err, *named) == []
+from .conftest import SMALL, Command, assert_refused, table
 
 
 def stamps(store: Path) -> dict[Path, int]:
@@ -206,81 +165,6 @@ def test_other_bins_of_a_finished_store_need_no_realization(mcsim: Command, smal
     assert stamps(tmp_path / "small.zarr") == before
 
 
-SMALL = """\
-schema = 1
-name = "small"
-[sky]
-spectrum = "wmap7"
-lmax = 32
-[map]
-nside = 16
-[[channel]]
-name = "W1"
-beam = { kind = "elliptical_gaussian", fwhm_major_arcmin = 300.0, fwhm_minor_arcmin = 250.0 }
-scan = { kind = "parallel_transport", psi0_deg = 20.0 }
-[biposh]
-L_max = 2
-summary_bin = 10
-[ensemble]
-realizations = 10
-seed = 7
-"""
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (("run", "no-such-run"), ("no-such-run", "quickstart")),
-        (("run", "quickstart", "--realizations", "5"), ("--realizations", 5, "A:B")),
-        (("run", "quickstart", "--realizations", "50:20"), ("50:20", "0:64")),
-        (("run", "quickstart", "--resume"), ("quickstart.zarr", "--resume")),
-        (("run", "quickstart", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"), ("--workers", "--scheduler")),
-        (("run", "quickstart", "-o", "/proc/x.zarr"), ("/proc/x.zarr", "-o")),
-        (("info", "nothing.zarr"), ("nothing.zarr",)),
-        (("plot", "nothing.zarr"), ("nothing.zarr",)),
-        (("merge", "nothing.zarr", "-o", "x.zarr"), ("nothing.zarr",)),
-        (("scan", "no-such-scan"), ("no-such-scan", "planck")),
-        (("scan", "wmap", "--nside", "100"), ("nside", 100)),
-        (("config",), ("--schema",)),
-        (("beam", "nothing.fits"), ("nothing.fits", "FITS")),
-        (("beam", "."), (" . ", "FITS")),
-        (("beam", "quickstart", "--pixel-deg", "-1"), ("pixel_deg", "--pixel-deg")),
-        (("beam", "quickstart", "--m-max", "2"), ("m_max", "--m-max")),
-        (("beam", "quickstart", "-o", "x"), ("x", ".png")),
-        (("scan", "wmap", "-o", "x.foo"), ("x.foo", ".png")),
-        (("info", "."), (" . ",)),
-        (("info", ".", "--verify"), (" . ",)),
-        (("plot", "."), (" . ",)),
-        (("plot", ".", "--predict", "nothing.zarr"), (" . ",)),
-        (("plot", ".", "--exact"), ("--exact", "--predict")),
-        (("merge", ".", ".", "-o", "x.zarr"), (" . ",)),
-        (("fit", "nothing.zarr", "quickstart"), ("nothing.zarr",)),
-        (("predict", "quickstart", "-o", "x.txt"), ("x.txt", ".ecsv")),
-        (("predict", "nothing.toml"), ("nothing.toml",)),
-        (("scan", "wmap", "--smax", "2", "--nside", "-4"), ("nside", -4)),
-        (("scan", "wmap", "--sample-period-s", "nan"), ("sample_period_s", "nan")),
-        (("scan", "wmap", "--sample-period-s", "-1"), ("sample_period_s", -1)),
-        (("scan", "wmap", "--frame", "lunar"), ("frame", "lunar")),
-        (("scan", "wmap", "--line-of-sight", "Z"), ("'Z'", "A, B")),
-        (("bench", "--nside", "3"), ("map.nside", 3)),
-        (("bench", "--nside", "4", "--lmax", "40"), ("biposh.lmax", 40, "map.nside", 4, 11)),
-        (("effects", "gain_drit"), ("gain_drit", "gain_drift")),
-        (("run", "quickstart", "--realizations", "-1:3"), ("--realizations", "-1:3", "A:B")),
-        (("run", "quickstart", "--realizations", "0:1000"), ("0:1000", "0:64")),
-        (("run", "quickstart", "--scheduler", "nonsense"), ("nonsense", "5 s")),
-    ],
-)
-def test_bad_input_is_one_sentence(
-    words: tuple[str, ...], named: tuple[object, ...], mcsim: Command, tmp_path: Path
-) -> None:
-    assert_refused(mcsim(*words), *named)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_unknown_option_is_exit_code_2(mcsim: Command) -> None:
-    assert mcsim("run", "quickstart", "--no-such-option")[0] == 2
-
-
 def test_config_checks_and_prints_the_schema(mcsim: Command) -> None:
     code, out, _ = mcsim("config", "quickstart")
     assert code == 0
@@ -331,39 +215,6 @@ def test_predict_plot_and_fit(mcsim: Command, small_store: Path, tmp_path: Path)
     assert json.loads(out[: out.rindex("]") + 1])[0]["kind"] == "plain"
 
 
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        (("--kind", "paired"), "paired"),
-        (("--model", "cubic"), "cubic"),
-        (("--model", "linear", "--model", "linear"), "linear, linear"),
-        (("--model", "spline", "--knots", 2), "2 knots"),
-        (("--order", "second"), "second"),
-        (("--mode", "L2M0"), "L2M0"),
-        (("--mode", "L2M3d0"), "L2M3d0"),
-        (("--mode", "L2M0d-2"), "L2M0d-2"),
-        (("--mode", "L3M0d1"), "L3M0d1"),
-        (("--mode", "L2M0d0", "--mode", "L2M0d0"), "L2M0d0"),
-        (("--pair", "V1,V1"), "V1,V1"),
-        (("--ell-min", 20, "--ell-max", 15), "20"),
-        (("--ell-min", 900), "900"),
-        (("--covariance", "nothing.zarr"), "nothing.zarr"),
-    ],
-)
-def test_options_of_fit_that_mean_nothing(
-    options: tuple[object, ...], named: str, mcsim: Command, small_store: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "small.toml").write_text(SMALL)
-    assert_refused(mcsim("fit", small_store, "small.toml", *options), named)
-    assert [path.name for path in tmp_path.iterdir()] == ["small.toml"]
-
-
-@pytest.mark.parametrize("words", [("small.toml", "STORE"), ("nothing.zarr", "small.toml"), ("STORE", "nothing.toml")])
-def test_files_of_fit_that_are_none(words: tuple[str, str], mcsim: Command, small_store: Path, tmp_path: Path) -> None:
-    (tmp_path / "small.toml").write_text(SMALL)
-    assert_refused(mcsim("fit", *(small_store if word == "STORE" else word for word in words)))
-
-
 def test_a_terminal_without_greek_letters() -> None:
     """What it cannot show is a question mark, and no UnicodeEncodeError."""
     program = "import sys, mcsim.cli\nsys.argv = ['mcsim', 'config', 'µ']\nmcsim.cli.main()"
@@ -372,26 +223,6 @@ def test_a_terminal_without_greek_letters() -> None:
     assert (done.returncode, done.stdout) == (2, "")
     assert "?" in done.stderr
     assert "Traceback" not in done.stderr
-
-
-def test_a_disk_that_fails_is_one_sentence(mcsim: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full() -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "picture.png")
-
-    monkeypatch.setattr(cli, "app", full)
-    code, _, err = mcsim("effects")
-    assert (code, err.count("\n")) == (1, 1)
-    assert unnamed(err, "picture.png") == []
-
-
-def test_too_little_memory_is_one_sentence(mcsim: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    def large() -> None:
-        raise MemoryError("Unable to allocate 49.2 TiB")
-
-    monkeypatch.setattr(cli, "app", large)
-    code, _, err = mcsim("effects")
-    assert (code, err.count("\n")) == (1, 1)
-    assert unnamed(err, "49.2", "nside", "lmax", "smax") == []
 
 
 def test_version(mcsim: Command) -> None:
@@ -421,15 +252,6 @@ def test_plot_reads_what_predict_wrote(ending: str, mcsim: Command, small_store:
     assert_refused(mcsim("plot", small_store, "--predict", f"expected.{ending}", "--exact"), "--exact")
 
 
-@pytest.mark.parametrize("name", ["nothing.zarr", "nothing.ecsv", "store.zarr", "text.ecsv", "columns.ecsv"])
-def test_a_file_that_is_no_prediction_is_refused(name: str, mcsim: Command, small_store: Path, tmp_path: Path) -> None:
-    (tmp_path / "store.zarr").symlink_to(small_store)
-    (tmp_path / "text.ecsv").write_text("no table")
-    Table({"L": [2], "value": [1.0]}).write(tmp_path / "columns.ecsv", format="ascii.ecsv")
-    assert_refused(mcsim("plot", small_store, "--predict", name, "-o", "x.png"), name)
-    assert not (tmp_path / "x.png").exists()
-
-
 @pytest.mark.parametrize("ending", tables.ENDINGS)
 def test_summary_is_exported_into_a_new_folder_and_no_prediction(
     ending: str, mcsim: Command, small_store: Path, tmp_path: Path
@@ -439,80 +261,6 @@ def test_summary_is_exported_into_a_new_folder_and_no_prediction(
     assert (tmp_path / file).exists()
     assert_refused(mcsim("plot", small_store, "--predict", file, "-o", "x.png"), file)
     assert not (tmp_path / "x.png").exists()
-
-
-@pytest.mark.parametrize(
-    ("effect", "key"),
-    [
-        ('[[effects]]\nname = "gain_drift"', "[[effect]]"),
-        ('[[effect]]\nname = "gain_drit"', "gain_drift"),
-        ('[[effect]]\nname = "boost"\namplitude = 0.0\n[[effect]]\nname = "gain_drit"', "effect[1]"),
-        ('[[effect]]\nname = "gain_drift"\nchanel = "W1"', "channel"),
-        ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\namplitude = [1.0, 2.0]', "[1.0, 2.0]"),
-        ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\namplitude = 0.3', "channel[W1]"),
-        ('[[effect]]\nname = "gain_drift"', "channel"),
-        ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\nphase = 3.0', "phase"),
-        ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\namplitude = "large"', "amplitude"),
-        ('[[effect]]\nname = "gain_drift"\nchannel = "W1"\namplitude = 0.1', "pointed"),
-        ('[[effect]]\nname = "gain_drift"\nchannel = "V9"', "V9"),
-        ('[[effect]]\nname = "dipole_modulation"\nchannel = "W1"', "common"),
-        ('[[effect]]\nname = "beam_noncircularity"\nchannel = "W1"\namplitude = 1.0', "m_max"),
-    ],
-)
-def test_config_refuses_effects_that_run_refuses(effect: str, key: str, mcsim: Command, tmp_path: Path) -> None:
-    (tmp_path / "small.toml").write_text(f"{SMALL}{effect}\n")
-    refused_by_config_and_run(mcsim, key)
-    assert [file.name for file in tmp_path.iterdir()] == ["small.toml"]
-
-
-def test_config_refuses_a_beam_that_run_refuses(mcsim: Command, tmp_path: Path) -> None:
-    (tmp_path / "small.toml").write_text(SMALL.replace("major_arcmin = 300.0", "major_arcmin = 6000.0"))
-    refused_by_config_and_run(mcsim, "6000.0")
-
-
-def refused_by_config_and_run(mcsim: Command, key: str) -> None:
-    """Check that ``config``, ``run`` and ``run --dry-run`` refuse small.toml with one sentence, by file and key."""
-    answers = [
-        mcsim(*words) for words in (("config", "small.toml"), ("run", "small.toml"), ("run", "small.toml", "--dry-run"))
-    ]
-    for answer in answers:
-        assert_refused(answer, "small.toml", key)
-    assert len({err for _, _, err in answers}) == 1
-
-
-@pytest.mark.parametrize(
-    ("scan", "key"),
-    [
-        ('{ kind = "hit_averaged", model = "mine.toml" }', "spin_speed"),
-        ('{ kind = "hit_averaged", model = "wmap", line_of_sight = "left" }', "left"),
-        ('{ kind = "differencing", model = "wmap_focal_plane", pair = "W9" }', "W9"),
-        ('{ kind = "hit_averaged", model = "wmap", sample_period_s = 1e9 }', "channel[W1]"),
-    ],
-)
-def test_config_refuses_scans_that_run_refuses(scan: str, key: str, mcsim: Command, tmp_path: Path) -> None:
-    (tmp_path / "mine.toml").write_text('name = "mine"\nspin_speed = 3.0\n')
-    (tmp_path / "small.toml").write_text(SMALL.replace('{ kind = "parallel_transport", psi0_deg = 20.0 }', scan))
-    refused_by_config_and_run(mcsim, key)
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (("make", "quickstart", "-o", "made", "--cases", "-3"), "--cases"),
-        (("make", "quickstart", "-o", "made", "--sampled-share", "1.5"), "--sampled-share"),
-        (("make", "quickstart", "-o", "made", "--inventions", "nowhere.py"), "nowhere.py"),
-        (("make", "nowhere.toml", "-o", "made"), "nowhere.toml"),
-        (("draws", "quickstart", "-o", "made", "--number", "0"), "--number"),
-        (("draws", "quickstart", "-o", "made", "--weakest", "30"), "from 30 to 20"),
-        (("run", "nowhere"), "nowhere"),
-        (("score", "nowhere"), "nowhere"),
-    ],
-)
-def test_a_challenge_refuses_wrong_options(mcsim: Command, tmp_path: Path, words: tuple[str, ...], named: str) -> None:
-    code, _, error = mcsim("challenge", *words)
-    assert code == 2
-    assert named in error
-    assert not list((tmp_path / "made").rglob("*.json"))
 
 
 def test_pictures_come_beside_what_they_show(mcsim: Command, tmp_path: Path) -> None:

@@ -22,10 +22,7 @@ from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
 from refusals import refused
 
-from .conftest import ensemble, table
-from .test_cli import SMALL, Command, assert_refused, mcsim
-
-__all__ = ["mcsim"]
+from .conftest import SMALL, Command, assert_refused, ensemble, table
 
 SCAN = {"kind": "hit_averaged", "model": "wmap", "sample_period_s": 61.0, "line_of_sight": "A"}
 

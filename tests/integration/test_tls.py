@@ -16,7 +16,7 @@ import yaml
 
 from mcsim import cli
 
-from .test_cli import SMALL, assert_refused
+from .conftest import SMALL, assert_refused
 from .test_runner import assert_same
 
 TEMPLATE = Path(__file__).parents[2] / "workflows" / "cluster" / "tls.yaml"
