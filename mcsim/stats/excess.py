@@ -38,12 +38,15 @@ class HeldOut:
 
         The excess grows, or falls by less than half of the prediction, or by less than half where what remains has a
         p-value up to ``level``. The last needs no prediction: a half of the data that asks for no effect predicts that
-        nothing is removed.
+        nothing is removed. Of hardly any excess before no fraction is known, but that it grows is.
         """
         before, fraction, expected = self.before.value, self.achieved, self.predicted
         if self.pvalue_after <= level and fraction.value + sigma * fraction.sigma < 0.5:
             return True
         grows = fraction.value * before + sigma * fraction.sigma * abs(before) < 0.0
+        if self.pvalue_after <= level:
+            error = np.hypot(self.before.sigma, self.after.sigma)  # at most: both are of the same data
+            grows = grows or self.after.value - before > sigma * error
         short = expected.value - fraction.value > sigma * np.hypot(expected.sigma, fraction.sigma)
         return bool(grows or (short and before > 0.0 and fraction.value < 0.5 * min(expected.value, 1.0)))
 

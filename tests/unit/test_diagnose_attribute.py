@@ -439,6 +439,17 @@ def test_set_that_leaves_a_significant_half_is_not_named(bench, achieved, pvalue
     assert named or "what remains differs from the simulations" in notes[0]
 
 
+@pytest.mark.parametrize(
+    ("after", "pvalue", "refuted"), [(213.0, 1e-18, True), (213.0, 0.1, False), (90.0, 1e-4, False)]
+)
+def test_a_gap_that_a_set_makes_refutes_it_though_there_was_hardly_one(after, pvalue, refuted):
+    """The fraction of 14 +- 10 has an error as large as itself; that it becomes 213 +- 30 has not."""
+    before = Measured(14.0, 10.0)
+    fraction = Measured(1.0 - after / 14.0, after / 14.0)
+    found = HeldOut(Measured(0.5, 1.0), fraction, before, Measured(after, 30.0), pvalue, "odd degrees")
+    assert found.refutes(3.0, 1e-3) == refuted
+
+
 def test_what_remains_is_said_to_differ_only_if_it_does():
     raised = (Measured(0.0, 0.1), Measured(-2.0, 0.5), Measured(100.0, 10.0), Measured(300.0, 10.0))
     assert "differs" not in words.refuted(HeldOut(*raised, 0.4, "half2"))
