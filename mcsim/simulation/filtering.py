@@ -38,7 +38,7 @@ from mcsim.support.code import package_digest
 
 LOWEST = 2  #: lowest degree in bins: the monopole and the dipole of a map are not those of its sky
 PAIRS = 20  #: pairs of random probes for each number whose Fisher matrix they estimate
-LEAST_PAIRS = 10  #: the same of probes that are asked for: half of the probes has a quarter, which must have an inverse
+LEAST_PAIRS = 2  #: the least number of the same with which a matrix is inverted
 LEVELS = 1024  #: of the noise that predictions tell apart
 TOLERANCE = 1e-6  #: relative residual at which the inverse covariance of a map is found
 
@@ -236,13 +236,16 @@ def _unbiased(halves: Sequence[tuple[Matrix, float]], pairs: float) -> float:
     -----
     For independent pairs it is that of Hartlap, Simon & Schneider (2007, A&A 464, 399, eq. 17). But a probe is in many
     of them, which adds a bias in inverse proportion to the number of probes: tr(F_1^-1 F_2) of the halves, whose mean
-    is one without a bias, has twice that of the whole.
+    is one without a bias, has twice that of the whole. Halves of fewer than :data:`LEAST_PAIRS` pairs for each number
+    tell nothing, and what is left of the bias stays.
     """
     size = len(halves[0][0])
 
     def independent(count: float) -> float:
         return (count - size - 1.0) / count
 
+    if min(count for _, count in halves) < LEAST_PAIRS * size:
+        return independent(pairs)
     (one, first), (two, second) = ((total / count, count) for total, count in halves)
     traces = [
         independent(count) * float(np.trace(np.linalg.solve(a, b))) / size

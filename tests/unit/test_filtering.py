@@ -239,6 +239,8 @@ def test_the_inverse_of_an_estimated_matrix_is_unbiased() -> None:
     assert error < 0.01
     assert abs(np.mean(found) - 1.0) < 3.0 * error
     assert np.mean(independent) - 1.0 > 5.0 * error
+    few = [(total, 47.0) for total, _ in halves]
+    assert _unbiased(few, 190.0) == (190 - size - 1) / 190
 
 
 @pytest.mark.slow
