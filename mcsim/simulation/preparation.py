@@ -57,6 +57,26 @@ class Preparation:
         """Return what the steps multiply the pixel window with, shape (lmax + 1,)."""
         return np.asarray(np.prod([np.ones(lmax + 1), *(step.pixel_window(lmax) for step in self.steps)], axis=0))
 
+    @property
+    def filtering(self) -> int:
+        """Return the number of steps before the first in harmonics: they leave white noise white."""
+        return next((number for number, step in enumerate(self.steps) if step.transforms), len(self.steps))
+
+    def noise_window(self, lmax: int) -> NDArray[np.float64]:
+        """Return what the steps multiply the a_lm of white noise with, but for its local power, shape (lmax + 1,).
+
+        Means over pixels that share no pixel leave white noise white: their windows count after a filter alone.
+        """
+        later = Preparation(self.steps[self.filtering :], self.nside, self.frame)
+        return later.beam_window(lmax) * later.pixel_window(lmax)
+
+    def noise_band(self, fine: int) -> float:
+        """Return the variance of the noise over its local power, 1/sr, of maps made at nside ``fine``."""
+        if not self.transforms:
+            return 1.0 / healpy.nside2pixarea(self.nside)
+        ell = np.arange(3 * fine)
+        return float(np.sum((2 * ell + 1) / (4 * np.pi) * self.noise_window(ell[-1]) ** 2))
+
     def noise_uk(self, noise_uk: Map, hits: Map) -> Map:
         """Return the standard deviation of white noise after the steps, uK, 0 without data.
 
@@ -64,14 +84,11 @@ class Preparation:
         """
         fine = healpy.npix2nside(hits.size)
         power = np.where(hits > 0, noise_uk**2, np.nan) * healpy.nside2pixarea(fine)
-        for step in self.steps:
-            power = step.noise(power)
-        band = 1.0 / healpy.nside2pixarea(self.nside)
-        if self.transforms:
-            ell = np.arange(3 * fine)
-            window = self.beam_window(ell[-1]) * self.pixel_window(ell[-1])
-            band = float(np.sum((2 * ell + 1) / (4 * np.pi) * window**2))
-        return np.sqrt(np.nan_to_num(band * power))
+        for number, step in enumerate(self.steps):
+            # Fewer pixels in a mean of correlated noise leave its variance as it is.
+            correlated = number > self.filtering and isinstance(step, Average)
+            power = step.local(power) if correlated else step.noise(power)
+        return np.sqrt(np.nan_to_num(self.noise_band(fine) * power))
 
     def weight(self) -> Map | None:
         """Return the product of the masks of the steps in the prepared pixels; None without one."""

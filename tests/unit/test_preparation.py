@@ -203,6 +203,7 @@ CASES = {
     "apodised": [{"kind": "mask", "mask": SOFT}, {"kind": "degrade", "nside": COARSE}],
     "masked": [{"kind": "mask", "mask": BAND}, {"kind": "degrade", "nside": COARSE}],
     "smoothed": [{"kind": "smooth", "fwhm_arcmin": 500.0}, {"kind": "degrade", "nside": COARSE}],
+    "averaged before smoothing": [{"kind": "degrade", "nside": 16}, {"kind": "smooth", "fwhm_arcmin": 300.0}],
     "harmonics": [{"kind": "degrade", "nside": COARSE, "method": "harmonics"}],
     "rotated": [{"kind": "rotate", "frame": "galactic"}],
 }
