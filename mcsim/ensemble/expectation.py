@@ -24,6 +24,9 @@ from mcsim.bipolar.theory.harmonics import spin_functions
 from mcsim.errors import InputError
 from mcsim.simulation import survey as survey_
 from mcsim.simulation.survey import Channel, Survey, SurveyMap
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix
+from mcsim.support.arrays import divided
 
 Source = str | Path | Mapping[str, Any] | config.RunConfig | Survey
 
@@ -32,6 +35,10 @@ L_MOMENTS = 64  #: highest degree of the orientation moments in predictions to a
 L_WEIGHTS, SHARE = range(64, 193, 32), 0.99
 """Highest degrees of moments times weights, of which the first is taken that holds this share of the weights' square.
 """
+
+FOLDED = 0.1  #: of prepared noise at the highest l: what averages fold into it from beyond the degrees of their pixels
+EVEN, MOVED = 1e-6, 0.01
+"""Variation of the power of noise that counts as none, and the share that a filter may move over the edge of a mask."""
 
 _LEFT_OUT = ("sky", "gain", "signal", "excess")  #: hooks of effects that no prediction follows
 
@@ -129,10 +136,13 @@ def moments_needed(survey: Survey, exact: bool, L_moments: int | None = None) ->
         return survey.config.biposh.L_max
     if L_moments is not None:
         return L_moments
-    shares = [held(weight, L_WEIGHTS[-1]) for weight in weights if weight is not None]
-    return max(
-        (next((L for L in L_WEIGHTS if share[L] >= SHARE), L_WEIGHTS[-1]) for share in shares), default=L_MOMENTS
-    )
+    return max((_degrees_of(weight) for weight in weights if weight is not None), default=L_MOMENTS)
+
+
+def _degrees_of(weight: NDArray[np.float64]) -> int:
+    """Return the first of ``L_WEIGHTS`` up to which a weight has nearly all of its square."""
+    share = held(weight, L_WEIGHTS[-1])
+    return next((L for L in L_WEIGHTS if share[L] >= SHARE), L_WEIGHTS[-1])
 
 
 def held(weight: NDArray[np.float64], L_max: int) -> NDArray[np.float64]:
@@ -173,7 +183,7 @@ def means(
     circular = signal(survey, (both[0].circular, both[1].circular), pair, modes, exact=False, nthreads=nthreads)
     noise = np.zeros_like(seen)
     if pair[0] == pair[1]:
-        noise = noise_mean(survey, pair[0], modes)
+        noise = noise_mean(survey, pair[0], modes, nthreads)
         repeated = [row for row, mode in enumerate(modes) if not mode.in_auto]
         for array in (seen, circular, noise):
             array[repeated] = np.nan
@@ -189,10 +199,11 @@ def spectrum(survey: Survey) -> NDArray[np.float64]:
     return survey.cl
 
 
-def noise_mean(survey: Survey, number: int, modes: Sequence[Indices]) -> NDArray[np.complex128]:
+def noise_mean(survey: Survey, number: int, modes: Sequence[Indices], nthreads: int = 1) -> NDArray[np.complex128]:
     """Return the mean BipoSH of the noise of a map, uK^2, shape (mode, lmax + 1).
 
-    Of a filtered map without the mean field, of which it is a part: for L = 0 alone.
+    Of a filtered map without the mean field, of which it is a part: for L = 0 alone. InputError for noise that is not
+    white, and for prepared noise that :func:`_of_steps_in_harmonics` does not follow.
     """
     m = survey.maps[number]
     L_max, lmax = max(L for L, _, _ in modes), survey.lmax
@@ -204,6 +215,9 @@ def noise_mean(survey: Survey, number: int, modes: Sequence[Indices]) -> NDArray
     found = np.zeros((len(modes), lmax + 1), dtype=np.complex128)
     if m.noise_uk is None:
         return found
+    if m.preparation is not None and m.preparation.transforms:
+        found = _of_steps_in_harmonics(survey, m, m.noise_uk**2, modes, nthreads)
+        return without_windows(survey, found, modes, (number, number))
     power = m.noise_uk**2 * nside2pixarea(m.moments.nside)
     if survey.filtering is not None:
         ell, isotropic = np.arange(lmax + 1), [L == 0 for L, _, _ in modes]
@@ -213,3 +227,74 @@ def noise_mean(survey: Survey, number: int, modes: Sequence[Indices]) -> NDArray
     weight = m.left_to_apply
     variance = map_harmonics(power if weight is None else power * weight**2, L_max)
     return without_windows(survey, noise_biposh(modes, variance, lmax), modes, (number, number))
+
+
+def _of_steps_in_harmonics(
+    survey: Survey, m: SurveyMap, variance: NDArray[np.float64], modes: Sequence[Indices], nthreads: int
+) -> NDArray[np.complex128]:
+    """Return the BipoSH of noise of a variance (uK^2) that steps in harmonics have left correlated, windows included.
+
+    Notes
+    -----
+    White noise of local power V(n) that filters multiply with w_l has the BipoSH of V times w_l1 w_l2. Where V is even,
+    it is an isotropic sky of spectrum V w_l^2, which weights W(n) after the filters couple as they do the CMB. No such
+    form is known where both V and W are uneven.
+    """
+    assert m.preparation is not None  # the caller looked
+    steps, lmax, fine = m.preparation, survey.lmax, survey.config.map.resolution
+    masks, weight = steps.filtered_weight(), m.left_to_apply
+    if masks is not None:
+        variance = divided(variance, masks**2)
+        weight = masks if weight is None else weight * masks
+    power, window = variance / steps.noise_band(fine), steps.noise_window(max(3 * fine - 1, lmax))
+    _check_folded(m, window, lmax)
+    if weight is None:
+        found = noise_biposh(modes, map_harmonics(power, max(L for L, _, _ in modes)), lmax)
+        for row, (L, _, d) in zip(found, modes, strict=True):
+            l2 = np.flatnonzero(existing(L, d, lmax))
+            row[l2] *= window[l2 - d] * window[l2]
+        return found
+    _check_even(m, power, window, weight)
+    ell, w = np.arange(window.size), map_harmonics(weight, _degrees_of(weight))
+    even = ScannedBeam(np.sqrt((2.0 * ell + 1.0) / (4.0 * np.pi))[None], w[None])
+    return cmb_biposh_leading(modes, power[weight != 0.0].mean() * window**2, lmax, even, nthreads=nthreads)
+
+
+def _check_folded(m: SurveyMap, window: NDArray[np.float64], lmax: int) -> None:
+    """Raise InputError for filtered noise that goes on beyond the degrees of the pixels that it is averaged in."""
+    end, ell = 3 * m.moments.nside - 1, np.arange(window.size)
+    beyond = float(np.sum(((2 * ell + 1) * window**2)[end + 1 :])) / (12 * m.moments.nside**2)
+    if beyond > FOLDED * window[lmax] ** 2:
+        raise InputError(
+            f"the noise of map {m.name} goes on beyond l = {end} where it is averaged after a step in harmonics: spread"
+            f" over all l this is {beyond / window[lmax] ** 2:.2g} of its power at l = {lmax}, and predictions take at "
+            f'most {FOLDED:g}; degrade before that step, or with method = "harmonics", or simulate it with mcsim run.'
+        )
+
+
+def _check_even(
+    m: SurveyMap, power: NDArray[np.float64], window: NDArray[np.float64], weight: NDArray[np.float64]
+) -> None:
+    """Raise InputError for noise that filters do not leave even where the weights after them are, or masks between."""
+    assert m.preparation is not None  # the caller looked
+    masked = f"map {m.name} is masked after a step in harmonics"
+    remedy = "simulate it with mcsim run, or leave the step or the mask out"
+    if m.preparation.masked_between:
+        raise InputError(f"{masked} and before another, which predictions of noise do not cover; {remedy}.")
+    seen = power[weight != 0.0]
+    if np.ptp(seen) > EVEN * seen.max():
+        lowest, highest = np.sqrt([seen.min(), seen.max()]) * 60.0 * np.degrees(1.0)
+        raise InputError(
+            f"{masked}, where its noise is {lowest:.3g} to {highest:.3g} uK arcmin, and predictions cover even noise "
+            f"there; {remedy}."
+        )
+    lmax = min(3 * m.moments.nside, window.size) - 1
+    filtered = alm_.multiply(healpix.analysis(power, lmax, 1), window[: lmax + 1], lmax)
+    after = healpix.synthesis(filtered[None], m.moments.nside, lmax)[0]
+    moved = abs(1.0 - float(np.mean(weight**2 * after) / np.mean(weight**2 * power)))
+    if moved > MOVED:
+        raise InputError(
+            f"{masked}, which moves {100 * moved:.2g} % of its noise between pixels that are seen and others with "
+            f"other noise, and predictions take at most {100 * MOVED:g} %; widen the mask of the analysis, or simulate "
+            "it with mcsim run."
+        )

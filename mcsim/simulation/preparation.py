@@ -70,6 +70,17 @@ class Preparation:
         later = Preparation(self.steps[self.filtering :], self.nside, self.frame)
         return later.beam_window(lmax) * later.pixel_window(lmax)
 
+    @property
+    def masked_between(self) -> bool:
+        """Return True if a mask stands between two steps in harmonics."""
+        masks = [number for number, step in enumerate(self.steps) if isinstance(step, Weighted)]
+        last = max((number for number, step in enumerate(self.steps) if step.transforms), default=0)
+        return any(self.filtering < number < last for number in masks)
+
+    def filtered_weight(self) -> Map | None:
+        """Return the product of the masks after the first step in harmonics, as :meth:`weight` does."""
+        return Preparation(self.steps[self.filtering :], self.nside, self.frame).weight()
+
     def noise_band(self, fine: int) -> float:
         """Return the variance of the noise over its local power, 1/sr, of maps made at nside ``fine``."""
         if not self.transforms:
