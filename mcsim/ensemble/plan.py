@@ -1,5 +1,6 @@
 """Plan of a run: its realizations, chunks, attributes and cost."""
 
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -16,7 +17,8 @@ from mcsim.ensemble.layout import Layout
 from mcsim.errors import InputError
 from mcsim.instrument.scan import read_moments
 from mcsim.instrument.scan.accumulate import SECONDS_PER_SAMPLE
-from mcsim.simulation import differencing, noise, offsets, skies
+from mcsim.simulation import differencing, noise, offsets, power, skies
+from mcsim.simulation import survey as survey_
 from mcsim.simulation.channels import check_beams, check_effects, check_scans, load_beam, refuse_external, scan_model
 from mcsim.simulation.filtering import Bands, probes_of
 from mcsim.simulation.preparation import preparation
@@ -28,6 +30,7 @@ from mcsim.sphere.mask import read_mask
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.support.code import version
 from mcsim.support.numbers import duration
+from mcsim.support.progress import reporting
 
 SOLUTION, NEAR = 100.0, 0.7
 """Transforms that a solution of the inverse covariance takes, about, and the share of them with a near one known."""
@@ -194,6 +197,7 @@ def describe(source: str | Path, part: slice | None = None, workers: int | None 
     check_scans(run)
     check_effects(run)
     _check_files(run)
+    _check_preparation(run)
     number, found = len(wanted(run, part)), with_scans(cost(run), run)
     memory, *rest = found.lines(number, workers or run.compute.workers)
     disk = float(found.layout.realization_bytes()) * number
@@ -220,6 +224,13 @@ def _check_files(run: config.RunConfig) -> None:
         if isinstance(channel.scan, config.ScanMoments):
             path = config.channel_path(channel.scan.path, channel.name, m.split)
             read_moments(path, run.map.resolution, load_beam(channel, run.sky.lmax).mmax, run.map.frame)
+
+
+def _check_preparation(run: config.RunConfig) -> None:
+    """Raise InputError, as the run itself would, for steps that cannot be applied to what the scans observe."""
+    if run.preparation:
+        with reporting("orientation moments", 1.0, "") as report:
+            power.check(survey_.survey(run, os.cpu_count() or 1, report))
 
 
 def cost(run: config.RunConfig) -> Cost:

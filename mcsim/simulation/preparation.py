@@ -49,6 +49,12 @@ class Preparation:
             prepared = step.apply(prepared)
         return np.where(np.isfinite(prepared), prepared, healpy.UNSEEN)
 
+    def check(self, hits: Map) -> None:
+        """Raise InputError if a step cannot be applied to maps of these hits."""
+        seen = np.where(hits > 0, 1.0, np.nan)
+        for step in self.steps:
+            seen = step.check(seen)
+
     def beam_window(self, lmax: int) -> NDArray[np.float64]:
         """Return what the steps multiply B_l with, shape (lmax + 1,)."""
         return np.asarray(np.prod([np.ones(lmax + 1), *(step.beam_window(lmax) for step in self.steps)], axis=0))

@@ -30,6 +30,10 @@ class Step(ABC):
     def apply(self, map_uk: Map) -> Map:
         """Return the map after the step, uK, NaN where not observed."""
 
+    def check(self, seen: Map) -> Map:
+        """Raise InputError if the step cannot be applied to a map that is NaN where ``seen`` is; return it after it."""
+        return self.apply(seen)
+
     def beam_window(self, lmax: int) -> NDArray[np.float64]:
         """Return what the step multiplies B_l with, shape (lmax + 1,)."""
         return np.ones(lmax + 1)
@@ -95,6 +99,10 @@ class Filter(Step):
         alm = healpix.analysis(_complete(map_uk, self.name), lmax, ITERATIONS)
         return healpix.synthesis(alm_.multiply(alm, self.beam * self.pixels, lmax)[None], self.coarse, lmax)[0]
 
+    def check(self, seen: Map) -> Map:
+        _complete(seen, self.name)
+        return np.ones(12 * self.coarse**2)
+
     def beam_window(self, lmax: int) -> NDArray[np.float64]:
         """Return the factors, zero above their end."""
         return _resized(self.beam, lmax, 0.0)
@@ -130,6 +138,10 @@ class Regression(Step):
             raise InputError("the templates of a preparation cannot be told apart outside the mask; leave one out.")
         return map_uk - np.linalg.solve(normal, weighted @ map_uk[used]) @ self.columns
 
+    def check(self, seen: Map) -> Map:
+        self.apply(seen)
+        return seen
+
 
 @dataclass(frozen=True, eq=False)
 class Filled(Step):
@@ -145,11 +157,9 @@ class Filled(Step):
     value_uk: float | None
 
     def apply(self, map_uk: Map) -> Map:
-        hole = self.masked | ~np.isfinite(map_uk)
+        hole = self._hole(map_uk)
         if self.value_uk is not None:
             return np.where(hole, self.value_uk, map_uk)
-        if hole.all():
-            raise InputError("a preparation has no observed pixel to fill the others from; widen its mask.")
         filled = map_uk.copy()
         matrix, edge = _neighbours(hole.tobytes(), healpy.npix2nside(hole.size))
         known = edge @ np.where(hole, 0.0, map_uk)
@@ -158,6 +168,15 @@ class Filled(Step):
             raise InputError("the diffuse filling of a preparation does not converge; fill a smaller mask.")
         filled[hole] = found
         return filled
+
+    def check(self, seen: Map) -> Map:
+        return np.where(self._hole(seen), 1.0, seen)
+
+    def _hole(self, map_uk: Map) -> NDArray[np.bool_]:
+        hole = self.masked | ~np.isfinite(map_uk)
+        if self.value_uk is None and hole.all():
+            raise InputError("a preparation has no observed pixel to fill the others from; widen its mask.")
+        return np.asarray(hole)
 
     def local(self, values: NDArray) -> NDArray:
         """Return the values; filled pixels have no data."""
@@ -197,6 +216,9 @@ class Rotated(Step):
         lmax = 2 * self.nside
         alm = healpix.analysis(_complete(map_uk, "rotate"), lmax, iterations=3)
         return healpix.synthesis(rotation.rotate_alm(alm, lmax, self.before, self.after)[None], self.nside, lmax)[0]
+
+    def check(self, seen: Map) -> Map:
+        return _complete(seen, "rotate")
 
     def beam_window(self, lmax: int) -> NDArray[np.float64]:
         """Return 1 up to 2 nside, where the harmonics end."""

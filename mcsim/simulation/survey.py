@@ -273,6 +273,7 @@ def _prepared(run: config.RunConfig, spec: config.Channel, channel: Channel) -> 
     for split, m in zip(run.map.each_split, channel.maps, strict=True):
         assert m.preparation is not None  # as of every map of a run that declares one
         steps = m.preparation
+        steps.check(m.moments.hits)
         moments = steps.moments(m.moments)
         noise = None if m.noise_uk is None else steps.noise_uk(m.noise_uk, m.moments.hits)
         weight = _weight(run, spec, split, m.name, moments, steps.weight())

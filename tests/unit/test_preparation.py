@@ -11,6 +11,7 @@ import mcsim
 from mcsim import config
 from mcsim.config import preparation as declared
 from mcsim.diagnosis.api import _warnings
+from mcsim.ensemble import plan
 from mcsim.ensemble.prepare import prepare_files
 from mcsim.simulation import power, sampled, simulate, windows
 from mcsim.simulation.preparation import preparation
@@ -317,6 +318,46 @@ def test_too_little_sky_is_refused_where_a_preparation_is_declared(tmp_path):
     enough = survey(replace(low, sky=replace(low.sky, lmax=needed)))
     power.check(enough)
     assert power.neglected(enough) is None
+
+
+def every_command(run, folder):
+    """What a user may do with a run, the maps of which are at nside 32."""
+    return (
+        lambda: mcsim.run(run, folder / "some.zarr", quiet=True),
+        lambda: plan.describe(run),
+        lambda: mcsim.predict(run),
+        lambda: mcsim.write_maps(run, folder / "maps"),
+        lambda: mcsim.diagnose(run, [X], folder / "verdict"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("steps", "named"),
+    [
+        ([{"kind": "smooth", "fwhm_arcmin": 600.0}], ("smooth", "fill")),
+        ([{"kind": "subtract_dipole"}, {"kind": "rotate", "frame": "galactic"}], ("rotate", "fill")),
+        ([{"kind": "subtract_dipole", "mask": np.where(Z > 0.99, 1.0, 0.0)}], ("0 pixels", "4 templates")),
+    ],
+)
+def test_steps_that_the_scan_does_not_allow_are_refused_before_anything_is_written(steps, named, tmp_path):
+    moments = mcsim.Moments.from_model("wmap", FINE, 2, "ecliptic", (0.0, 0.4))
+    hits = np.where(Z < 0.95, moments.hits, 0.0)
+    seen = hits > 0
+    moments = replace(moments, hits=hits, w=np.where(seen, moments.w, 0.0), dtheta=None, dphi=None, offset_moments=None)
+    run = run_with(*steps)
+    run = run_with(*steps, channel=[config.to_dict(run)["channel"][0] | {"scan": {"kind": "moments", "path": moments}}])
+    holes = () if "0 pixels" in named else (int(np.sum(~seen)),)
+    for call in every_command(run, tmp_path):
+        with refused(*named, *holes):
+            call()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_steps_that_follow_a_filling_are_accepted():
+    """Of the parts of the sky alone that data will have, without the steps themselves."""
+    steps = [{"kind": "fill"}, {"kind": "smooth", "fwhm_arcmin": 600.0}, {"kind": "degrade", "nside": COARSE}]
+    run = run_with(*steps, {"kind": "mask", "mask": np.ones(12 * COARSE**2)})
+    preparation(run, run.channels[0], None).check(BAND)
 
 
 def test_a_sky_that_is_accepted_and_still_too_small_is_told():
