@@ -202,13 +202,15 @@ def _change_of_beam(step: declared.Smooth, spec: config.Channel, lmax: int) -> N
     if step.fwhm_arcmin is not None:
         target = healpy.gauss_beam(np.deg2rad(step.fwhm_arcmin / 60.0), lmax)
     else:
-        target = read_window(config.channel_path(str(step.window), spec.name), lmax)
+        found = read_window(config.channel_path(str(step.window), spec.name))
+        target = _up_to(lmax, found, f"the target beam of {spec.name}")
     if step.own_fwhm_arcmin is not None:
         own = healpy.gauss_beam(np.deg2rad(step.own_fwhm_arcmin / 60.0), lmax)
     elif step.own_window is not None:
-        own = read_window(config.channel_path(step.own_window, spec.name), lmax)
+        found = read_window(config.channel_path(step.own_window, spec.name))
+        own = _up_to(lmax, found, f"own_window of {spec.name}")
     else:
-        own = load_beam(spec, lmax).window
+        own = _up_to(lmax, _own_window(spec, lmax), f"the beam of {spec.name}")
     end = int(np.argmin(np.append(np.minimum(np.abs(target), np.abs(own)) > NEGLIGIBLE, False)))
     change: NDArray[np.float64] = target[:end] / own[:end]
     if end == 0 or np.abs(change).max() > LARGEST_GAIN:
@@ -217,6 +219,29 @@ def _change_of_beam(step: declared.Smooth, spec: config.Channel, lmax: int) -> N
             f"them more than {LARGEST_GAIN:g} times; choose a wider target."
         )
     return change
+
+
+def _own_window(spec: config.Channel, lmax: int) -> NDArray[np.float64]:
+    """Return B_l of a channel's beam, up to lmax or to the end of its file."""
+    if isinstance(spec.beam, config.BeamWindow):
+        file = config.channel_path(spec.beam.path, spec.name)
+        return read_window(file, None, spec.beam.extension, spec.beam.column)
+    if isinstance(spec.beam, config.BeamBlm):
+        file = config.channel_path(spec.beam.path, spec.name)
+        return Beam.from_blm(file, mmax=0).window
+    return load_beam(spec, lmax).window
+
+
+def _up_to(lmax: int, window: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+    """Return B_l up to lmax; raise InputError, with what helps, if they end below."""
+    if window.size > lmax:
+        return window[: lmax + 1]
+    coarser = 1 << (window.size // 3).bit_length() >> 1
+    degraded = f', or degrade the maps to nside {coarser} before the step "smooth"' if coarser else ""
+    raise InputError(
+        f"{name} ends at l = {window.size - 1}, but maps of nside {(lmax + 1) // 3} are smoothed up to l = {lmax} "
+        f"(3 nside - 1); give a longer table{degraded}."
+    )
 
 
 def _harmonics(nside: int, monopole: bool, dipole: bool) -> NDArray[np.float64]:

@@ -132,6 +132,24 @@ def test_smoothing_starts_from_the_channels_beam():
     assert channel.beam.mmax == survey(run_with()).channels[0].beam.mmax
 
 
+@pytest.mark.parametrize(
+    ("step", "beam"),
+    [
+        ({"window": healpy.gauss_beam(0.2, 70)}, {}),
+        ({"fwhm_arcmin": 480.0, "own_window": healpy.gauss_beam(0.05, 70)}, {}),
+        ({"fwhm_arcmin": 480.0}, {"kind": "window", "path": healpy.gauss_beam(0.05, 70)}),
+        ({"fwhm_arcmin": 480.0}, {"kind": "blm", "path": mcsim.Beam.gaussian(170.0, lmax=70).blm}),
+    ],
+)
+def test_tables_that_end_below_the_pixels_are_refused_with_what_helps(step, beam):
+    steps = [{"kind": "smooth"} | step]
+    run = run_with(*steps)
+    changes = {"channel": [config.to_dict(run)["channel"][0] | ({"beam": beam} if beam else {})]}
+    with refused("V", 70, 95, FINE, "3 nside", "degrade", 16):
+        survey(run_with(*steps, **changes))
+    survey(run_with({"kind": "degrade", "nside": 16}, *steps, **changes))
+
+
 @pytest.mark.parametrize("weights", [BAND, SOFT])
 def test_dipole_is_that_of_healpy(weights, rng):
     map_uk = rng.standard_normal(NPIX) + 30.0 + 5.0 * X - 8.0 * Z
