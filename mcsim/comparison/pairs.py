@@ -23,7 +23,7 @@ from mcsim.simulation.noise import of_map
 from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
-from mcsim.sphere.checks import UNSEEN_BELOW, check_map
+from mcsim.sphere.checks import UNSEEN_BELOW, check_map, check_not_infinite
 from mcsim.support import resources
 from mcsim.support.arrays import Alm, reals
 from mcsim.systematics.base import Pointing
@@ -350,8 +350,7 @@ def _without_holes(map_uk: NDArray[np.float64]) -> NDArray[np.float64]:
 def _checked(map_uk: NDArray[np.float64], name: str) -> int:
     """Return nside of a map; raise InputError if that is none, or if pixels are infinite."""
     nside = check_map(map_uk, name=name)
-    if infinite := int(np.isinf(map_uk).sum()):
-        raise InputError(f"{name} has {infinite} pixels that are infinite; mark what was not observed as UNSEEN.")
+    check_not_infinite(map_uk, name)
     return nside
 
 

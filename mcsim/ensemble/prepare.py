@@ -14,7 +14,7 @@ from mcsim.ensemble.maps import file_names, write_map
 from mcsim.errors import InputError
 from mcsim.simulation.preparation import preparation
 from mcsim.sphere import spectra
-from mcsim.sphere.checks import UNSEEN_BELOW, check_map
+from mcsim.sphere.checks import UNSEEN_BELOW, check_map, check_not_infinite
 from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Map, reals
 from mcsim.support.folders import appearing, unwritable, user_path, writable
@@ -94,6 +94,7 @@ def _prepared(run: config.RunConfig, name: str, map_: ArrayLike) -> Map:
     spec, split = _map_called(run, name)
     given = reals(map_, f"map {name}", healpy.UNSEEN)
     check_map(given, run.map.resolution, f"map {name}")
+    check_not_infinite(given, f"map {name}")
     steps = preparation(run, spec, split, observed=True)
     assert steps is not None  # the run has steps
     prepared = steps.apply(given)

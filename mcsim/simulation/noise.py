@@ -16,7 +16,7 @@ from mcsim.instrument.scan import MapGrid, Moments
 from mcsim.simulation import timestream
 from mcsim.simulation.channels import scan_model
 from mcsim.sphere import header, healpix
-from mcsim.sphere.checks import UNSEEN_BELOW
+from mcsim.sphere.checks import UNSEEN_BELOW, check_not_infinite
 from mcsim.sphere.mask import read_mask
 from mcsim.support.arrays import Map, divided
 
@@ -239,6 +239,8 @@ def _positive(path: Path, moments: Moments, names: Sequence[str]) -> tuple[Map, 
     """Return a map of hits or variances, 0 where nothing was observed, and its unit."""
     values, _, unit = healpix.read_map(path, tuple(names), moments.frame)
     _check_nside(values, path, moments)
+    if names is healpix.HITS:
+        check_not_infinite(values, str(path))  # an infinite variance is that of a pixel that was not observed
     values = np.where(np.isfinite(values) & (values > UNSEEN_BELOW), values, 0.0)
     if unit is None and names is healpix.VARIANCE and 0.0 < values.max() < SMALLEST_UK2:
         raise InputError(

@@ -110,6 +110,12 @@ def check_complete(map_: NDArray, name: str = "the map") -> None:
         raise InputError(f"{name} has pixels that are not finite or unseen (UNSEEN); set them to 0 by a mask first.")
 
 
+def check_not_infinite(map_: NDArray, name: str) -> None:
+    """Raise InputError if pixels of a map are infinite, which is no word for not observed."""
+    if infinite := int(np.isinf(map_).sum()):
+        raise InputError(f"{name} has {infinite} pixels that are infinite; mark what was not observed as UNSEEN.")
+
+
 def nside_of(npix: int, where: str) -> int:
     """Return nside of a full sky of ``npix`` pixels; raise an InputError that names ``where`` if there is none."""
     nside = math.isqrt(max(npix, 0) // 12)

@@ -14,7 +14,16 @@ from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.sphere.checks import UNSEEN_BELOW, check_alm, check_complete, check_map, check_nside, check_whole, nside_of
+from mcsim.sphere.checks import (
+    UNSEEN_BELOW,
+    check_alm,
+    check_complete,
+    check_map,
+    check_not_infinite,
+    check_nside,
+    check_whole,
+    nside_of,
+)
 from mcsim.sphere.header import first_table, frame_named, opened, to_uk
 from mcsim.support.arrays import Alm, Map
 from mcsim.support.code import package_digest
@@ -270,9 +279,11 @@ def read_map(path: Path, names: tuple[str, ...] = (), frame: str | None = None) 
 def read_uk(path: Path, frame: str, frequency_ghz: float | None) -> Map:
     """Read a map of temperatures, uK, in RING order; what was not observed stays as it is.
 
-    Raise InputError as :func:`read_map` does, or if the header names a unit that cannot be converted.
+    Raise InputError as :func:`read_map` does, if the header names a unit that cannot be converted, or if pixels are
+    infinite.
     """
     map_, _, unit = read_map(path, frame=frame)
+    check_not_infinite(map_, str(path))
     return np.where(map_ > UNSEEN_BELOW, to_uk(unit, path, frequency_ghz) * map_, map_)
 
 

@@ -190,3 +190,17 @@ def test_what_needs_white_noise_says_so(files):
         noise_mean(shared, 0, shared.estimator.modes)
     with refused("W", "white", "variance", "correlated"):
         model_of(shared, mcsim.DiagnosisSettings())
+
+
+def test_infinite_pixels_are_no_holes(observed):
+    """But those of a variance are: nothing was observed there."""
+    broken, hits = observed[:2].copy(), HITS[:2].copy()
+    broken[1, :9] = -np.inf
+    with refused("9 pixels", "UNSEEN"):
+        difference_level(run_with({"kind": "difference", "maps": list(broken), "hits": list(hits)}), "W")
+    hits[0, :4] = np.inf
+    with refused("4 pixels", "UNSEEN"):
+        difference_level(run_with({"kind": "difference", "maps": list(observed[:2]), "hits": list(hits)}), "W")
+    variance = np.where(np.arange(NPIX) < 7, np.inf, 100.0)
+    [m] = survey(run_with({"kind": "variance", "variance": variance})).maps
+    assert np.sum(m.moments.hits == 0) == 7

@@ -427,6 +427,8 @@ def test_declared_steps_that_cannot_be_are_refused(step, named):
         ([{"kind": "fill"}], np.full(NPIX, healpy.UNSEEN), ("mask",)),
         ([{"kind": "subtract_dipole"}], np.full(NPIX, healpy.UNSEEN), ("0 pixels", "4 templates")),
         ([{"kind": "subtract_dipole"}], np.zeros(48), ("nside 2", 32)),
+        ([{"kind": "degrade", "nside": 8}], np.where(Z > 0.99, np.inf, X), ("V", np.sum(Z > 0.99), "UNSEEN")),
+        ([{"kind": "degrade", "nside": 8}], np.where(Z > 0.99, -np.inf, X), ("V", np.sum(Z > 0.99), "UNSEEN")),
         ([], X, ("prepared", "[[preparation]]")),
     ],
 )
@@ -451,7 +453,12 @@ def test_files_are_prepared(tmp_path, rng):
         prepare_files(run, [f"V={tmp_path / 'raw.fits'}"] * 2, tmp_path / "other")
     with refused("Q", "prepared"):
         prepare_files(run, [f"Q={tmp_path / 'raw.fits'}"], tmp_path / "other")
-    healpy.write_map(tmp_path / "V.fits", map_uk, coord="G", dtype=np.float64)
+    for value in (np.inf, -np.inf):
+        infinite = np.where(np.arange(NPIX) < 5, value, map_uk)
+        healpy.write_map(tmp_path / "V.fits", infinite, coord="E", overwrite=True, dtype=np.float64)
+        with refused(tmp_path / "V.fits", "5 pixels", "UNSEEN"):
+            prepare_files(run, [str(tmp_path / "V.fits")], tmp_path / "other")
+    healpy.write_map(tmp_path / "V.fits", map_uk, coord="G", overwrite=True, dtype=np.float64)
     with refused(tmp_path / "V.fits", "map.frame", "galactic", "ecliptic"):
         prepare_files(run, [str(tmp_path / "V.fits")], tmp_path / "other")
 
