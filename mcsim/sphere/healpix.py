@@ -240,13 +240,16 @@ VARIANCE = ("II_COV", "VARIANCE", "I_VAR", "COV_II", "VAR_I", "VAR")
 """Names of columns with the variance of the temperature."""
 
 
-def read_map(path: Path, names: tuple[str, ...] = (), frame: str | None = None) -> tuple[Map, str | None, str | None]:
+def read_map(
+    path: Path, names: tuple[str, ...] = (), frame: str | None = None, bad: float = healpy.UNSEEN
+) -> tuple[Map, str | None, str | None]:
     """Read a map of a HEALPix FITS file in RING order, and its frame and unit if the header has them.
 
     It is the column that is called one of ``names``; without names the temperature, or else the first column. A file
-    with a single column need not name it. A .npy file holds an array of shape (npix,) in RING order; its frame and unit
-    are None. Raise InputError if the file cannot be read as a HEALPix map, does not say whether it is RING or NESTED,
-    or names an unknown frame, or another one than ``frame``.
+    with a single column need not name it. Pixels of the value that the header calls BAD_DATA become ``bad``. A .npy
+    file holds an array of shape (npix,) in RING order; its frame and unit are None. Raise InputError if the file cannot
+    be read as a HEALPix map, does not say whether it is RING or NESTED, names an unknown frame, or another one than
+    ``frame``, or has a BAD_DATA that is no number.
     """
     if path.suffix == ".npy":
         array = read_npy(path, "biuf").astype(np.float64)
@@ -273,7 +276,21 @@ def read_map(path: Path, names: tuple[str, ...] = (), frame: str | None = None) 
             f'{path} is in {found} coordinates, but it is needed in {frame} ones; set map.frame = "{found}", so that '
             "the scan and the noise are computed there, or rotate it."
         )
-    return np.asarray(map_), found, unit
+    return _replaced(np.asarray(map_), keywords.get("BAD_DATA"), bad, path), found, unit
+
+
+def _replaced(map_: Map, stated: object, bad: float, path: Path) -> Map:
+    """Return a map with ``bad`` for the BAD_DATA of its header (None: no such keyword), equal in single precision."""
+    if stated is None:
+        return map_
+    try:
+        value = float(str(stated))
+    except ValueError:
+        raise InputError(
+            f"{path} has BAD_DATA = {stated!r}, which is no number; give the value of bad pixels."
+        ) from None
+    with np.errstate(over="ignore"):
+        return np.where(map_.astype(np.float32) == np.float32(value), bad, map_)
 
 
 def read_uk(path: Path, frame: str, frequency_ghz: float | None) -> Map:

@@ -27,11 +27,12 @@ def read_mask(
 
     Notes
     -----
-    The nside is changed by ``healpy.ud_grade``, the frame pixel by pixel (:func:`mcsim.sphere.rotation.rotate_pixels`)
-    at the finer of the two resolutions. The edge is apodised last: its width does not depend on the file's resolution.
+    Pixels of the value that the header calls BAD_DATA have weight 0. The nside is changed by
+    ``healpy.ud_grade``, the frame pixel by pixel (:func:`mcsim.sphere.rotation.rotate_pixels`) at the finer of the two
+    resolutions. The edge is apodised last: its width does not depend on the file's resolution.
     """
     check_nside(nside)
-    mask, stated, _ = healpix.read_map(path)
+    mask, stated, _ = healpix.read_map(path, bad=0.0)
     found = healpy.get_nside(mask)
     if found & (found - 1):
         raise InputError(f"{path} has nside {found}, which is not a power of two; bring the mask to one that is.")

@@ -103,7 +103,11 @@ def test_soft_edge_damps_the_small_scales_of_the_mask():
 
 @pytest.mark.parametrize(
     ("values", "named"),
-    [(np.full(768, 2.0), ("mask.fits", "0 ... 1")), (np.ones(12 * 9), ("mask.fits", "nside", 3))],
+    [
+        (np.full(768, 2.0), ("mask.fits", "0 ... 1")),
+        (np.full(768, -np.inf), ("mask.fits", "0 ... 1")),
+        (np.ones(12 * 9), ("mask.fits", "nside", 3)),
+    ],
 )
 def test_bad_values(write, values, named):
     with refused(*named):

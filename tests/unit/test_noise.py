@@ -14,6 +14,7 @@ from mcsim.datavector.wiener_filter import model_of
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import header, healpix
+from mcsim.sphere.mask import read_mask
 from refusals import refused
 
 NSIDE = 16
@@ -74,6 +75,24 @@ def test_the_temperature_need_not_be_the_first_column(tmp_path):
     map_, _, unit = healpix.read_map(Path(path))
     assert np.array_equal(map_, np.sin(PIXEL))
     assert unit == "uK"
+
+
+@pytest.mark.parametrize("bad", [-999.9, 0.0, "-1e20", healpy.UNSEEN])
+def test_pixels_of_the_value_that_a_header_calls_bad_are_not_observed(bad, tmp_path):
+    seen = PIXEL % 7 > 0
+    columns = {
+        "TEMPERATURE": np.where(seen, 2.0 + np.sin(PIXEL), float(bad)),
+        "N_OBS": np.where(seen, HITS, float(bad)),
+    }
+    path = Path(table(tmp_path / "some.fits", columns, {"TEMPERATURE": "mK"}, COORDSYS="G", BAD_DATA=bad))
+    expected = np.where(seen, 1e3 * columns["TEMPERATURE"], healpy.UNSEEN)
+    assert healpix.read_uk(path, "galactic", None) == pytest.approx(expected)
+    [m] = survey(run_with({"sigma0_uk": 300.0, "hits": str(path)})).maps
+    assert np.array_equal(m.moments.hits > 0, seen)
+    weights = table(tmp_path / "mask.fits", {"MASK": np.where(seen, 0.5, float(bad))}, COORDSYS="G", BAD_DATA=bad)
+    assert np.array_equal(read_mask(Path(weights), NSIDE, "galactic"), 0.5 * seen)
+    with refused("BAD_DATA", "'none'", "number"):
+        healpix.read_map(Path(table(tmp_path / "none.fits", columns, BAD_DATA="none")))
 
 
 def test_part_of_the_sky_is_read_by_its_pixels(tmp_path):
