@@ -14,7 +14,7 @@ each order gives that of every beam.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 
 import healpy
@@ -44,6 +44,9 @@ SHARP = 30.0
 preconditioner has no such sharp end (:class:`mcsim.simulation.preconditioner.Preconditioner`)."""
 
 
+EXACT = 0.1  #: filter_tolerance of the exact filter
+
+
 @dataclass(frozen=True)
 class Part:
     """Describe one map of the data: its place in the survey, and its weights."""
@@ -70,6 +73,7 @@ class Model:
     #: of all maps, if they lack a part of the sky; None, and of maps whose noise is not white or that show the sky
     #: beyond lmax: the isotropic filter
     inverse: InverseCovariance | None
+    white: bool  # the noise of pixels is independent, and the maps do not show the sky beyond lmax
     sky_power: Cl  # of s^: E|s^_lm|^2 / C_l = C_l / (C_l + N_l) in the isotropic approximation
     settings: DiagnosisSettings
 
@@ -94,6 +98,17 @@ class Model:
         rows, which = np.unique(self.response, axis=0, return_inverse=True)
         groups = (np.flatnonzero(which.ravel() == row) for row in range(len(rows)))
         return tuple((row, sum(map(self.of, group.tolist()), ())) for row, group in zip(rows, groups, strict=True))
+
+    @cached_property
+    def exact(self) -> "Model":
+        """Return the model with the inverse covariance of all maps, samples' offsets included, if noise is white.
+
+        Its filter goes on until what all maps have alike, which is nearly all sky, is known to a tenth of its residual.
+        """
+        if not self.white:
+            return self
+        inverse = _inverse(self.cl, self.response, self.parts, offsets=True)
+        return replace(self, inverse=inverse, settings=replace(self.settings, filter_tolerance=EXACT))
 
     def of(self, channel: int) -> tuple[int, ...]:
         """Return the indices of the channel's maps."""
@@ -146,17 +161,22 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     snr = survey.cl * sum(response[part.channel] ** 2 / part.noise_power for part in parts)
     lmax = _highest_degree(survey, snr)
     hidden = max(float(np.mean(part.precision == 0.0)) for part in parts)
-    white = not survey.config.preparation and np.all(snr[lmax + 1 :] <= 1.0) and snr[lmax] <= SHARP
+    known = not survey.config.preparation and bool(np.all(snr[lmax + 1 :] <= 1.0) and snr[lmax] <= SHARP)
+    white = known and all(m.drawn is None and m.pairs is None for channel in survey.channels for m in channel.maps)
     cl, response, snr = survey.cl[: lmax + 1], response[:, : lmax + 1], snr[: lmax + 1]
     dipole = dipole_alm(survey.channels[0].site.dipole_uk, lmax)
-    inverse = _inverse(cl, response, parts) if white and hidden >= settings.hidden_share else None
-    return Model(survey, lmax, survey.nside, cl, response, tuple(parts), dipole, inverse, snr / (1.0 + snr), settings)
+    inverse = _inverse(cl, response, parts) if known and hidden >= settings.hidden_share else None
+    power = snr / (1.0 + snr)
+    return Model(survey, lmax, survey.nside, cl, response, tuple(parts), dipole, inverse, white, power, settings)
 
 
-def _inverse(cl: Cl, response: NDArray[np.float64], parts: Sequence[Part]) -> InverseCovariance:
-    """Return the inverse covariance of all maps, of the circular parts of their beams at the centres of pixels."""
+def _inverse(cl: Cl, response: NDArray[np.float64], parts: Sequence[Part], offsets: bool = False) -> InverseCovariance:
+    """Return the inverse covariance of all maps, of the circular parts of their beams.
+
+    They are those at the centres of pixels, or, with ``offsets``, at the means of their samples.
+    """
     through = [convolve.Response(row[None].astype(np.complex128)) for row in response]
-    observed = [ObservedMap(through[part.channel], part.precision) for part in parts]
+    observed = [ObservedMap(through[p.channel], p.precision, p.moments if offsets else None) for p in parts]
     return InverseCovariance(cl, observed)
 
 

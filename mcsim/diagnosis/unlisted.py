@@ -11,7 +11,6 @@ from mcsim import config
 from mcsim.datavector.analysis import simulated_maps
 from mcsim.datavector.campaign import Ask, constrained_jobs
 from mcsim.datavector.halves import Halves
-from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.words import refuted
@@ -20,8 +19,8 @@ from mcsim.reconstruction.grammar import ALIKE, Structure
 from mcsim.reconstruction.plugin import Plugin, plugin
 from mcsim.reconstruction.result import NSIDE, WORDS, Reconstructed
 from mcsim.reconstruction.scores import Scene
-from mcsim.reconstruction.search import Search
-from mcsim.reconstruction.simulated_scores import scene_for, scores_of_maps, search_of, with_peaks
+from mcsim.reconstruction.search import Response, Search
+from mcsim.reconstruction.simulated_scores import filtered, scene_for, scores_of_maps, search_of, with_peaks
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Map, Matrix, Vector
@@ -90,10 +89,10 @@ def structures_of(
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """Simulated skies: maps of the first, mean scores, shape (P,), and data vectors, shape (p,) or (0,), of all."""
+    """Simulated skies: maps of the first, scores of all, shape (skies, P), and their mean data vector, (p,) or (0,)."""
 
     maps: list[Map]
-    scores: Vector
+    scores: Matrix
     x: Vector
 
 
@@ -112,7 +111,9 @@ class Reconstruction:
     _trial: dict[int, tuple[Matrix, Matrix]] = field(default_factory=dict, repr=False)
     _kept: dict[int, tuple[Vector, Vector]] = field(default_factory=dict, repr=False)
 
-    def simulated(self, effects: Sequence[Plugin], share: Vector | None = None, tested: bool = False) -> Simulated:
+    def simulated(
+        self, effects: Sequence[Plugin], share: Vector | None = None, tested: bool = False, skies: int = SKIES
+    ) -> Simulated:
         """Return maps and scores of skies that the data constrain, with effects or shares of them.
 
         ``tested``: the data vectors, too, which cost as much.
@@ -122,7 +123,7 @@ class Reconstruction:
         acting = [(one.name, None if kinds[one.name].scope == "common" else one.channel) for one in effects]
         tables = [config.Effect(name=name, channel=channel, parameters={"amplitude": 1.0}) for name, channel in acting]
         job, plain = (
-            constrained_jobs(analysis, t, self.data.same_skies.observed, range(SKIES))[0] for t in (tables, [])
+            constrained_jobs(analysis, t, self.data.same_skies.observed, range(skies))[0] for t in (tables, [])
         )
         maps = list(simulated_maps(job, {**dict(analysis.library), **kinds}))
         if share is not None:
@@ -130,12 +131,16 @@ class Reconstruction:
             maps = [[a + f * (b - a) for f, a, b in zip(share, one, made, strict=True)] for made, one in pairs]
         scores_ = [scores_of_maps(analysis.model, self.scene, one) for one in maps]
         x = np.mean([analysis.data_vector(m) for m in maps], axis=0) if tested else np.zeros(0)
-        return Simulated(maps[0], np.mean(scores_, axis=0), x)
+        return Simulated(maps[0], np.stack(scores_), x)
 
     @cached_property
     def before(self) -> Simulated:
         """Return the same without effects."""
         return self.simulated([], tested=True)
+
+    def made(self, effects: Sequence[Plugin], share: Vector | None = None, skies: int = SKIES) -> Vector:
+        """Return what effects make of all scores on these skies, shape (P,)."""
+        return np.mean(self.simulated(effects, share, skies=skies).scores - self.before.scores[:skies], axis=0)
 
     def fitted(self, chosen: Sequence[int]) -> Fitted:
         """Return coordinates and covariance of structures, their effects at amplitudes that fit, and what these leave.
@@ -153,42 +158,39 @@ class Reconstruction:
             self._fitted[key] = ([*fits, fit], *self._calibrated(chosen, [*plugins, made]))
         return self._fitted[key]
 
-    def responses(self, members: Sequence[int], rest: Vector) -> list[Matrix]:
-        """Return what the effects of structures, fitted to scores, make of all scores; their mean where there is none.
+    def response(self, member: int, rest: Vector) -> Response:
+        """Return what the effect of a structure, fitted to scores, makes of all scores; on average where there is none.
 
-        A pattern of few coordinates acts on few modes of this sky: each of them has its own response. Shape (k, P).
+        A pattern of few coordinates acts on few modes of this sky: each of them has its own response. Several others
+        have that of their fit and of what it leaves of their scores, because few simulations tell their covariance.
         """
-        found = self.search.mean_responses(members, rest)
-        self._trial.clear()
-        for row, k in enumerate(members):
-            structure = self.search.grammar[k]
-            ((theta, _),) = self.search.fit([structure], rest)
-            each = theta[None]
-            if structure.has_phase:
-                each = self._turned(structure, theta, rest)[None]
-            if structure.by_coordinate:
-                each = float(np.linalg.norm(theta)) * np.eye(structure.size)
-            shape, share = structure, None
-            if structure.split != ALIKE and structure.by_map:
-                shape, share = replace(structure, split=ALIKE), np.zeros(len(self.scene.views))
-                share[list(structure.views)] = structure.weights
-            effects = [plugin("unlisted", shape, one, self.scene) for one in each]
-            if structure.moving:
-                found[row] = self._moved(structure, theta)[None]
-            elif None not in effects:
-                rows = [self.simulated([one], share).scores for one in effects if one is not None]
-                found[row] = np.stack(rows) - self.before.scores
-            self._trial[k] = each, found[row]
+        structure, (each, average) = self.search.grammar[member], self.search.response(member, rest)
+        theta = each[0]
+        if (made := self._made_by(structure, theta)) is None:
+            found = each, average
+        elif structure.by_coordinate:
+            units = float(np.linalg.norm(theta)) * np.eye(structure.size)
+            found = units, np.stack([row for one in units if (row := self._made_by(structure, one)) is not None])
+        elif structure.size > 1:
+            _, _, (amplitudes,) = self.search.judged([member], rest, [(each, made[None])])
+            ((more, _),) = self.search.fit([structure], rest - amplitudes[0] * made)
+            also = self._made_by(structure, more)
+            found = (each, made[None]) if also is None else (np.stack([theta, more]), np.stack([made, also]))
+        else:
+            found = each, made[None]
+        self._trial[member] = found
         return found
 
-    def _turned(self, structure: Structure, theta: Vector, rest: Vector) -> Vector:
-        """Return coordinates of which simulated responses, of each by itself, make the structure's own scores."""
-        each = float(np.linalg.norm(theta)) * np.eye(structure.size)
-        effects = [plugin("unlisted", structure, one, self.scene) for one in each]
-        if None in effects:
-            return theta
-        made = np.stack([self.simulated([one]).scores for one in effects if one is not None]) - self.before.scores
-        return np.asarray(self.search.amplitudes([structure], rest, made) @ each)
+    def _made_by(self, structure: Structure, theta: Vector) -> Vector | None:
+        """Return what a structure makes of all scores; None if no effect of the simulator can be like it."""
+        if structure.moving:
+            return self._moved(structure, theta)
+        shape, share = structure, None
+        if structure.split != ALIKE and structure.by_map:
+            shape, share = replace(structure, split=ALIKE), np.zeros(len(self.scene.views))
+            share[list(structure.views)] = structure.weights
+        effect, skies = plugin("unlisted", shape, theta, self.scene), 1 if structure.stage == "added" else SKIES
+        return None if effect is None else self.made([effect], share, skies)
 
     def _moved(self, structure: Structure, theta: Vector) -> Vector:
         """Return what a beam that follows a wave makes of all scores, on skies that the data constrain."""
@@ -197,10 +199,10 @@ class Reconstruction:
         plain = constrained_jobs(analysis, [], self.data.same_skies.observed, range(SKIES))[0]
         found = []
         for maps in simulated_maps(plain):
-            sky = wiener_filter(analysis.model, maps).sky
+            sky = filtered(analysis.model, maps).sky
             added = share * self.scene.moved(structure.moving, structure.order, theta, sky)
             found.append(scores_of_maps(analysis.model, self.scene, list(np.add(maps, added))))
-        return np.asarray(np.mean(found, axis=0) - self.before.scores)
+        return np.asarray(np.mean(found - self.before.scores, axis=0))
 
     def keep(self, member: int, amplitudes: Vector) -> None:
         """Keep the coordinates that these amplitudes of the responses mean, and what they make of the scores."""
@@ -219,7 +221,7 @@ class Reconstruction:
         acting = [k for k, one in enumerate(plugins) if one is not None]
         if not acting:
             return list(plugins), self.x
-        responses = np.stack([self.simulated([one]).scores for one in plugins if one is not None]) - self.before.scores
+        responses = np.stack([self.made([one]) for one in plugins if one is not None])
         structures_ = [self.search.grammar[chosen[k]] for k in acting]
         factors = self.search.amplitudes(structures_, self.x, responses)
         scaled = dict(zip(acting, factors, strict=True))

@@ -51,7 +51,8 @@ IN_MAPS = ("beam", "elsewhere", "noise", "square", "cube", "rotation")
 
 ANY = f"1-{HARMONICS}"  #: of a wave in any way: a constant and all harmonics
 
-ALSO_COMMON = ("monopole", "dipole", "degrees 0-1")
+LOWEST = "degrees 0-1"  #: kind of a monopole and a dipole
+ALSO_COMMON = ("monopole", "dipole", LOWEST)
 """Patterns that all channels may have alike: in the sky itself, but skies of a model have none of them."""
 
 INDICES = (-3.0, -2.0, 1.5)
@@ -141,12 +142,9 @@ class Structure:
         return self.frame == "sky" and bool(self.acts_on) and self.size <= FREE
 
     @property
-    def has_phase(self) -> bool:
-        """Return True for a gain that follows one wave: its phase is found by the responses of cosine and sine.
-
-        Where the filter leaves uneven noise the scatter of its scores is not their response.
-        """
-        return (self.stage, self.frame, self.size) == ("gain", "time", 2)
+    def leaves_low(self) -> bool:
+        """Return True if the scores leave out monopoles and dipoles that the structure makes."""
+        return self.stage == "modulation" or (self.stage, self.acts_on) == ("gain", "sky")
 
     def elsewhere(self, other: "Structure") -> bool:
         """Return True if another is the same in another channel or split, or in all channels by their frequency."""

@@ -358,8 +358,7 @@ class Scene:
     def _of_sky(self, sky: Alm) -> Vector:
         """Return the scores of the sky's power, of patterns that multiply it, and of its motion.
 
-        For what acts on the sky itself the residuals of all maps together are S^-1 s^: the uneven noise that the
-        isotropic filter leaves in them would drown it.
+        For what acts on the sky itself the residuals of all maps together are S^-1 s^, without monopole and dipole.
         """
         weight = _twice(self.lmax) * np.abs(sky) ** 2
         power = 0.5 * divided(1.0, self.cl) * np.bincount(alm_.degrees(self.lmax), weight, self.lmax + 1)

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.reconstruction.grammar import ALIKE, ANY, MEANS, Structure
+from mcsim.reconstruction.grammar import ALIKE, ANY, INDICES, LOWEST, MEANS, Structure
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 
@@ -24,9 +24,9 @@ MOST = 3  #: largest number of structures
 SECOND = 0.1
 """Least fall of chi^2 of a further structure over that of the first: below it may be the square of the first."""
 
-FINALISTS, NEAR, SPARE = 20, 5.0, 2
-"""Structures that are compared by their responses on the sky of the data: how many at most, within which difference of
-the evidence those of one stage and frame, and simulations for each of their scores."""
+FINALISTS, NEAR = 20, 5.0
+"""Structures that are compared by their responses on the sky of the data: how many at most, and within which difference
+of the evidence those of one stage and frame."""
 
 RARE = 3.0
 """Odds against a structure that differs between splits, acts on sky or dipole alone, a cube, a halo, a signal from
@@ -34,16 +34,24 @@ elsewhere (the dipole of the opposite direction is a gain's), and of a function 
 there are several."""
 
 TAIL = 0.1  #: share of the simulations by which the tail of the largest evidence is described
+LEAST = 0.01  #: information, relative to the largest, of a combination of responses that is fitted
 SMALL = 1e-6  #: variance, relative to the largest, of a direction in which scores are not inverted
 ALTERNATIVES = 20.0  #: odds up to which other structures are told beside the best
 RIVAL = 4.0  #: odds up to which the next one, if it is of other words, is as good a description as the best
 
 
+Response = tuple[Matrix, Matrix]
+"""Coordinates of a structure, shape (k, coordinates), and what each row makes of all scores, shape (k, P)."""
+
+
 class Sky(Protocol):
     """What structures do on the sky of the data."""
 
-    def responses(self, members: Sequence[int], rest: Vector) -> list[Matrix]:
-        """Return what structures, fitted to scores, or each of their coordinates make of all scores, (k, P) each."""
+    def response(self, member: int, rest: Vector) -> Response:
+        """Return coordinates of a structure, fitted to scores, and what they make of all scores.
+
+        Of a pattern that acts on few modes of this sky the coordinates are one by one.
+        """
 
     def keep(self, member: int, amplitudes: Vector) -> None:
         """Take the amplitudes of the responses of a structure for its own."""
@@ -74,6 +82,7 @@ class Search:
     simulations: Matrix
     #: evidences of structures that data choose from a continuum, in each simulation, shape (N, n)
     peaks: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
+    exact: bool = True  #: what a structure makes of its own scores is their variance, as by the inverse covariance
 
     @cached_property
     def nulls(self) -> tuple[SimulatedGaussian | None, ...]:
@@ -140,7 +149,7 @@ class Search:
             if p > LEVEL:
                 break
             members = self.finalists(values)
-            responses = self.mean_responses(members, rest) if sky is None else sky.responses(members, rest)
+            responses = [(self if sky is None else sky).response(k, rest) for k in members]
             judged, falls, amplitudes = self.judged(members, rest, responses)
             order = np.argsort(-judged)
             best = int(order[0])
@@ -156,7 +165,7 @@ class Search:
             chosen = [one.structure for one in found]
             if sky is not None:
                 sky.keep(members[best], amplitudes[best])
-            rest = rest - amplitudes[best] @ responses[best] if sky is None else sky.left(chosen)
+            rest = rest - amplitudes[best] @ responses[best][1] if sky is None else sky.left(chosen)
         return found
 
     def evidences(self, scores: Vector) -> Vector:
@@ -198,9 +207,7 @@ class Search:
 
         These are the best of every other stage, the same in other channels, splits or profiles, whose own scores do not
         tell all that they do to the others, the same function of something else and with fewer harmonics, those near
-        it, and the best of every frame. Of many among which the data
-        choose it is the best. All their scores together have as many elements as a fraction 1/SPARE of the simulations
-        at most.
+        it, and the best of every frame. Of many among which the data choose it is the best.
         """
         order = [k for k in map(int, np.argsort(-values)) if values[k] > 0.0]
         each = [self.grammar[k] for k in order]
@@ -217,34 +224,60 @@ class Search:
         wanted += _firsts(beside, [(self.grammar[k].acts_on, self.grammar[k].kind.endswith(ANY)) for k in beside])
         wanted += [k for k in order if values[order[0]] - values[k] < NEAR]
         wanted += _firsts(order, [(one.stage, one.acts_on, one.frame) for one in each])
-        chosen, rows = list[int](), 0
-        for k in _firsts(wanted, [self.grammar[k].choice or k for k in wanted]):
-            if len(chosen) < FINALISTS and rows + self.grammar[k].size <= len(self.simulations) // SPARE:
-                chosen.append(k)
-                rows += self.grammar[k].size
-        return chosen
+        return _firsts(wanted, [self.grammar[k].choice or k for k in wanted])[:FINALISTS]
 
     def judged(
-        self, members: Sequence[int], scores: Vector, responses: Sequence[Matrix]
+        self, members: Sequence[int], scores: Vector, responses: Sequence[Response]
     ) -> tuple[Vector, Vector, list[Vector]]:
-        """Return evidence, fall of chi^2 and amplitudes of structures in the scores of all of them.
+        """Return evidence, fall of chi^2 and amplitudes of structures, each in its own scores.
 
-        Each has one or more responses, shape (k, P).
+        These say all that maps tell of it. Those of a pattern that multiplies the sky leave out the monopoles and
+        dipoles of the product, which count besides.
         """
-        null = SimulatedGaussian.from_simulations(self._rows(members, self.simulations), floor=SMALL)
-        x = self._rows(members, scores)
-        fits = [null.fit(x, self._rows(members, one).T) for one in responses]
-        falls = null.hartlap_factor * np.array([one.delta_chi2 for one in fits])
-        return self._evidences(falls[:, None], members)[:, 0], falls, [one.amplitudes for one in fits]
+        fits = [self._fit_on_sky(k, scores, *one) for k, one in zip(members, responses, strict=True)]
+        falls = np.array([fall for fall, _ in fits])
+        return self._evidences(falls[:, None], members)[:, 0], falls, [amplitudes for _, amplitudes in fits]
 
-    def mean_responses(self, members: Sequence[int], scores: Vector) -> list[Matrix]:
-        """Return the response of all scores to each structure as it is fitted, on average over skies, (1, P) each."""
-        centred, found = self.simulations - self.simulations.mean(axis=0), []
-        for k in members:
-            ((theta, _),) = self.fit([self.grammar[k]], scores)
-            own = self.grammar[k].of(centred) @ theta
-            found.append((own @ centred / (len(centred) - 1.0))[None])
-        return found
+    def _fit_on_sky(self, member: int, scores: Vector, coordinates: Matrix, made: Matrix) -> tuple[float, Vector]:
+        """Return fall of chi^2 and amplitudes of a structure, of whose coordinates it is known what they make.
+
+        What a structure that acts on the sky makes of its own scores on this sky is their variance there, which that of
+        all skies is not where few modes are bright.
+        """
+        structure, null = self.grammar[member], self.nulls[member]
+        x, t = structure.of(scores), structure.of(made)
+        if null is not None and not (structure.acts_on and self.exact):
+            fit = null.fit(x, t.T)
+            return null.hartlap_factor * fit.delta_chi2, fit.amplitudes
+        known, information = coordinates @ (x - structure.of(self.simulations).mean(axis=0)), coordinates @ t.T
+        if structure.leaves_low and self._low_null is not None:
+            white = np.sqrt(self._low_null.hartlap_factor) * self._low_null.whiten_templates(made[:, self._low].T)
+            known = known + white.T @ self._low_null.whiten(scores[self._low])
+            information = information + white.T @ white
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+        sizes, axes = np.linalg.eigh(0.5 * scale[:, None] * (information + information.T) * scale)
+        kept = sizes > LEAST * sizes[-1]
+        along = axes[:, kept].T @ (scale * known)
+        return float(np.sum(along**2 / sizes[kept])), scale * (axes[:, kept] @ (along / sizes[kept]))
+
+    @cached_property
+    def _low(self) -> NDArray[np.int64]:
+        """Return the places of the scores of monopoles and dipoles that are added to maps."""
+        rows = [one.rows.ravel() for one in self.grammar if one.says[:4] == ("added", "", "sky", LOWEST)]
+        return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *rows]))
+
+    @cached_property
+    def _low_null(self) -> SimulatedGaussian | None:
+        """Return their null distribution."""
+        low = self.simulations[:, self._low]
+        return SimulatedGaussian.from_simulations(low, floor=SMALL) if low.size else None
+
+    def response(self, member: int, scores: Vector) -> Response:
+        """Return coordinates of a structure, fitted to scores, and what they make of all, on average over skies."""
+        ((theta, _),) = self.fit([self.grammar[member]], scores)
+        centred = self.simulations - self.simulations.mean(axis=0)
+        own = self.grammar[member].of(centred) @ theta
+        return theta[None], (own @ centred / (len(centred) - 1.0))[None]
 
     def _falls(self, scores: Vector) -> Vector:
         """Return the unbiased fall of chi^2 of every structure by itself."""
@@ -265,9 +298,12 @@ class Search:
 
     def amplitudes(self, chosen: Sequence[Structure], scores: Vector, responses: Matrix) -> Vector:
         """Return the factors of simulated responses, shape (count, P), with which they describe the scores best."""
-        null = SimulatedGaussian.from_simulations(np.concatenate([w.of(self.simulations) for w in chosen], axis=1))
-        x, t = (np.concatenate([w.of(one) for w in chosen], axis=-1) for one in (scores, responses))
-        return null.fit(x, t.T).amplitudes
+        low = self._low if any(one.leaves_low for one in chosen) else self._low[:0]
+        simulations, x, t = (
+            np.concatenate([*(w.of(one) for w in chosen), one[..., low]], axis=-1)
+            for one in (self.simulations, scores, responses)
+        )
+        return SimulatedGaussian.from_simulations(simulations, floor=SMALL).fit(x, t.T).amplitudes
 
 
 def _firsts(order: Sequence[int], labels: Sequence[Hashable]) -> list[int]:
@@ -283,7 +319,8 @@ def _rarity(structure: Structure) -> float:
     part = structure.stage in ("gain", "square", "elsewhere") and structure.acts_on != "sky and dipole"
     odd = part or structure.stage == "cube" or structure.kind.endswith("low l")
     rare = (structure.split != ALIKE) + odd + (structure.stage == "elsewhere")
-    return rare * float(np.log(RARE)) + float(np.log(structure.tried))
+    tried = structure.tried * (1.0 if structure.index is None else len(INDICES))
+    return rare * float(np.log(RARE)) + float(np.log(tried))
 
 
 def evidence(fall: NDArray[np.float64], size: int) -> NDArray[np.float64]:

@@ -124,7 +124,7 @@ def scene_of(model: Model) -> Scene:
     )
     other = replace(model.survey, config=seeded(run, SEED))
     skies = (list(simulate.maps(other, SIMULATIONS + k)) for k in range(SPREAD))
-    return scene.with_spreads([wiener_filter(model, maps) for maps in skies])
+    return scene.with_spreads([filtered(model, maps) for maps in skies])
 
 
 def with_chosen(model: Model, scene: Scene, kinds: Sequence[str]) -> Scene:
@@ -247,7 +247,15 @@ def _wave(*values: tuple[str, Any], component: int) -> type[AddedToSamples]:
 
 def scores_of_maps(model: Model, scene: Scene, maps: Sequence[Map]) -> Vector:
     """Return the scores of the grammar, shape (P,)."""
-    return scene.values(wiener_filter(model, maps))
+    return scene.values(filtered(model, maps))
+
+
+def filtered(model: Model, maps: Sequence[Map]) -> FilteredMaps:
+    """Return filtered maps, by the noise of every pixel and the offsets of its samples, if their noise is white.
+
+    Only then is the scatter of scores, by which structures are fitted, their response to what they measure.
+    """
+    return wiener_filter(model.exact, maps)
 
 
 def scores(job: Job) -> Matrix:
@@ -256,14 +264,14 @@ def scores(job: Job) -> Matrix:
     Behind them stand the falls of chi^2 of peaks; if the job names kinds, the scores of these alone are returned.
     """
     model, scene = analysis_for(job).model, scene_for(job)
-    filtered = (wiener_filter(model, maps) for maps in simulated_maps(job))
+    each = (filtered(model, maps) for maps in simulated_maps(job))
     if job.chosen:
-        return np.stack([scene.chosen_values(one) for one in filtered])
-    return np.stack([np.append(scene.values(one), _falls(scene, one)) for one in filtered])
+        return np.stack([scene.chosen_values(one) for one in each])
+    return np.stack([np.append(scene.values(one), _falls(scene, one)) for one in each])
 
 
-def _falls(scene: Scene, filtered: FilteredMaps) -> list[float]:
-    return [one.fall for one in scene.peaks(filtered)]
+def _falls(scene: Scene, maps: FilteredMaps) -> list[float]:
+    return [one.fall for one in scene.peaks(maps)]
 
 
 def scene_for(job: Job) -> Scene:
@@ -280,7 +288,7 @@ def _scene(fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings,
 def search_of(analysis: Analysis, scene: Scene, ask: Ask) -> Search:
     """Return the search of the maps of a model."""
     null, count = null_scores(analysis, ask), len(scene.keys)
-    return Search(structures(scene), null[:, :count], _charged(scene, null[:, count:]))
+    return Search(structures(scene), null[:, :count], _charged(scene, null[:, count:]), analysis.model.white)
 
 
 def _charged(scene: Scene, falls: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -294,7 +302,7 @@ def with_peaks(analysis: Analysis, scene: Scene, search: Search, maps: Sequence[
 
     Periods are the same if they are so over the survey within half a cycle, and sources if a beam hardly tells them.
     """
-    found = scene.peaks(wiener_filter(analysis.model, maps))
+    found = scene.peaks(filtered(analysis.model, maps))
     evidences = _charged(scene, np.array([one.fall for one in found]))
     chosen = list[Choice]()
     for k in np.argsort(-evidences):
@@ -306,7 +314,7 @@ def with_peaks(analysis: Analysis, scene: Scene, search: Search, maps: Sequence[
     kinds = tuple(one.kind for one in chosen)
     more = with_chosen(analysis.model, scene, kinds)
     simulations = np.concatenate([search.simulations, null_scores(analysis, ask, kinds)], axis=1)
-    return more, Search(structures(more), simulations, search.peaks)
+    return more, replace(search, grammar=structures(more), simulations=simulations)
 
 
 def _same(scene: Scene, one: Choice, other: Choice) -> bool:

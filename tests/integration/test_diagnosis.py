@@ -28,6 +28,7 @@ from mcsim.errors import InputError
 from mcsim.reconstruction import simulated_scores
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
+from mcsim.sphere import real
 from mcsim.stats.look_elsewhere import global_test
 from mcsim.systematics import Parametrization
 from pictures import quick_pictures
@@ -105,6 +106,30 @@ def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small, tmp_path)
     assert DiagnosisResult.open(tmp_path).effects == found.effects
 
 
+def test_a_described_pattern_has_its_size(small):
+    """A quadrupole of one channel: by which of two channels, nothing tells, but by how much they differ."""
+    data = data_of(small.run)
+    maps = list(simulate.maps(data, 1))
+    pattern = real.field(np.array([0, 0, 0, 0, 0.3, -0.5, 2.0, 0.4, 0.6]), *healpy.pix2vec(16, np.arange(12 * 16**2)))
+    seen = healpy.alm2map(healpy.almxfl(healpy.map2alm(pattern, 40), data.channels[0].response.factors[0].real), 16)
+    maps[:2] = [one + 2.0 * seen for one in maps[:2]]
+    model = small.analysis.model
+    scene = simulated_scores.scene_for(small.analysis.job(small.run))
+
+    def scored(jobs):
+        return [simulated_scores.scores(job) for job in jobs]
+
+    search = simulated_scores.search_of(small.analysis, scene, scored)
+    (first, *_), _ = unlisted.structures_of(ObservedMaps(small, maps, ask), scene, search, scored)
+    assert (first.stage, first.frame, first.index) == ("added", "sky", None)
+    size = float(np.std(2.0 * seen))
+    assert first.relative_error < 0.1
+    assert abs(first.rms_uk / size - 1.0) < 4.0 * first.relative_error
+    noise = [sum(part.precision for part in model.parts if part.channel == k) for k in (0, 1)]
+    expected = float(np.sum((2.0 * seen) ** 2 / (1.0 / noise[0] + 1.0 / noise[1])))
+    assert abs(1.0 / first.relative_error**2 - expected) < 4.0 * np.sqrt(4.0 * expected)
+
+
 def test_an_unlisted_effect_is_described_written_and_shrinks(small, tmp_path, monkeypatch):
     """A gain that follows the year, which the library of this instrument does not have.
 
@@ -139,7 +164,7 @@ def test_an_unlisted_effect_is_described_written_and_shrinks(small, tmp_path, mo
     made, times, site = kind(amplitude=1.0), np.linspace(0.0, 3e7, 50), data_of(small.run).channels[1].site
     theta, phi = (np.full(50, angle) for angle in healpy.vec2dir(site.dipole_uk))
     of_dipole = made.signal(times, theta, phi, np.zeros(50), site)
-    wave = made.gain(times, site) if of_dipole is None else of_dipole / np.linalg.norm(site.dipole_uk)
+    wave = made.gain(times, site) if "sky" in first.acts_on else of_dipole / np.linalg.norm(site.dipole_uk)
     truth = 1.5e-3 * np.cos(2.0 * np.pi * times / 31558149.8 - np.deg2rad(40.0))
     assert np.sqrt(np.mean((wave - truth) ** 2)) < 4.0 * first.relative_error * np.sqrt(np.mean(truth**2))
     lines = words.summary(found, tmp_path / "out")

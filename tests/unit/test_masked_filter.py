@@ -1,4 +1,4 @@
-"""Maps that lack a part of the sky are filtered by their inverse covariance."""
+"""Maps that lack a part of the sky are filtered by their inverse covariance, and all maps where one asks for it."""
 
 from dataclasses import replace
 
@@ -8,6 +8,7 @@ import pytest
 
 from instruments import two_channels
 from mcsim import config
+from mcsim.config.noise import NoiseCorrelated
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import model_of, shared_sky, wiener_filter
 from mcsim.simulation import simulate
@@ -71,6 +72,33 @@ def test_the_score_of_a_signal_has_the_variance_of_its_response(run):
         excess.append(np.var(scores, ddof=1) / response)
     assert abs(excess[0] - 1.0) < 4.0 * np.sqrt(2.0 / 99)
     assert excess[1] > 1.2 * excess[0]
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_the_exact_filter_knows_the_noise_and_the_offsets_of_samples(run, hidden):
+    """On a sky far above uneven noise the isotropic filter leaves a score twice the variance of its response."""
+    noisy = [replace(one, noise=replace(one.noise, sigma0_uk=30.0)) for one in run.channels]
+    seen = run.map if hidden else replace(run.map, mask=None, mask_frame=None)
+    model = modelled(replace(run, channels=tuple(noisy), map=seen))
+    pattern = 3.0 * HEIGHT**2 - 1.0
+    skies, excess = [list(simulate.maps(model.survey, k)) for k in range(100)], []
+    for one in (model.exact, replace(model, inverse=None)):
+        scores = [wiener_filter(one, maps).residual[:2].sum(axis=0) @ pattern for maps in skies]
+        changed = [m + pattern if i < 2 else m for i, m in enumerate(skies[0])]  # in one channel of two
+        response = wiener_filter(one, changed).residual[:2].sum(axis=0) @ pattern - scores[0]
+        excess.append(np.var(scores, ddof=1) / response)
+    assert abs(excess[0] - 1.0) < 4.0 * np.sqrt(2.0 / 99)
+    assert excess[1] > 1.5 * excess[0]
+
+
+def test_the_exact_filter_is_of_white_noise_alone(run):
+    model = modelled(run)
+    assert model.white
+    assert model.exact.inverse.maps[0].moments is not None
+    stripes = NoiseCorrelated(sigma0_uk=200.0, f_knee_hz=1e-3, f_min_hz=1e-5)
+    unknown = modelled(replace(run, channels=(replace(run.channels[0], noise=stripes), *run.channels[1:])))
+    assert not unknown.white
+    assert unknown.exact is unknown
 
 
 def test_maps_that_keep_the_isotropic_filter(run):

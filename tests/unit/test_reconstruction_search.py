@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mcsim.reconstruction.grammar import ALIKE, ANY, Structure
+from mcsim.reconstruction.grammar import ALIKE, ANY, LOWEST, Structure
 from mcsim.reconstruction.search import ALTERNATIVES, LEVEL, MOST, Search, evidence
 
 
@@ -84,6 +84,41 @@ def test_what_is_there_is_found_with_its_size():
     assert abs(sigma[0, 0] * covariance[2, 2] - 1.0) < 5.0 * np.sqrt(2.0 / 400)
     response = (x - simulations.mean(axis=0)) / 2.0
     assert np.allclose(search.amplitudes([chosen[2]], x, response[None]), [2.0])
+
+
+def test_what_acts_on_the_sky_is_judged_by_what_it_makes_on_this_sky():
+    """The response is the information on this sky, and twice that of others where its modes are twice as bright."""
+    chosen, simulations, mix = toy(400)
+    place = np.array([[0]])
+    gain = Structure("gain", "sky and dipole", "", "constant", "W1", ALIKE, None, place, np.ones(1), None, (0,))
+    search = Search((chosen[0], gain), simulations)
+    x = 5.0 * (mix @ mix.T)[0] + simulations.mean(axis=0)
+    responses = [(one, 2.0 * made) for one, made in (search.response(k, x) for k in (0, 1))]
+    _, (added, multiplied), amplitudes = search.judged([0, 1], x, responses)
+    np.testing.assert_allclose(np.concatenate(amplitudes), 0.5, rtol=0.02)
+    assert multiplied == pytest.approx(0.5 * added, rel=0.02)
+    _, falls, _ = replace(search, exact=False).judged([0, 1], x, responses)
+    assert falls[1] == pytest.approx(added, rel=1e-6)
+
+
+def test_monopoles_and_dipoles_that_a_modulation_makes_count():
+    """Scores of a pattern that multiplies the sky leave them out."""
+    _, simulations, _ = toy(400)
+    low = Structure("added", "", "sky", LOWEST, "W1", ALIKE, None, np.array([[8], [9]]), np.ones(1), None, (0,))
+    places = np.array([[0], [1], [2]])
+    modulation = Structure("modulation", "sky", "sky", "degree 1", None, ALIKE, None, places, np.ones(1))
+    search = Search((low, modulation), simulations)
+    mean, covariance = simulations.mean(axis=0), np.cov(simulations.T)
+    made = np.zeros((3, 12))
+    made[:, :3] = 1e-3 * covariance[:3, :3]
+    made[0, 8:10] = 30.0 * np.sqrt(np.diag(covariance)[8:10])
+    x = mean + made[0]
+    own, own_amplitudes = search.judged([1], x, [(1e-3 * np.eye(3), 1e-3 * made)])[1:]
+    fall = made[0, 8:10] @ np.linalg.solve(covariance[8:10, 8:10], made[0, 8:10])
+    assert own[0] == pytest.approx(fall, rel=0.05)
+    assert own_amplitudes[0][0] == pytest.approx(1e3, rel=0.05)
+    (amplitude,) = search.amplitudes([modulation], x, made[:1])
+    assert amplitude == pytest.approx(1.0, rel=1e-6)
 
 
 def test_a_choice_among_many_is_charged():
