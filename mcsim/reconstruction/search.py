@@ -11,10 +11,12 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Protocol
 
+import healpy
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.reconstruction.grammar import ALIKE, ANY, INDICES, LOWEST, MEANS, Structure
+from mcsim.sphere import real
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 
@@ -34,6 +36,9 @@ elsewhere (the dipole of the opposite direction is a gain's), and of a function 
 there are several."""
 
 TAIL = 0.1  #: share of the simulations by which the tail of the largest evidence is described
+COARSE, TINY, LARGEST_FALL = 4, 1e-3, -0.9
+"""nside by which a pattern of variances is known, its departure from 1 that is none, and how far it may fall."""
+
 LEAST = 0.01  #: information, relative to the largest, of a combination of responses that is fitted
 SMALL = 1e-6  #: variance, relative to the largest, of a direction in which scores are not inverted
 ALTERNATIVES = 20.0  #: odds up to which other structures are told beside the best
@@ -248,7 +253,7 @@ class Search:
         x, t = structure.of(scores), structure.of(made)
         if null is not None and not (structure.acts_on and self.exact):
             fit = null.fit(x, t.T)
-            return null.hartlap_factor * fit.delta_chi2, fit.amplitudes
+            return null.hartlap_factor * fit.delta_chi2 * self._share(member, scores), fit.amplitudes
         known, information = coordinates @ (x - structure.of(self.simulations).mean(axis=0)), coordinates @ t.T
         if structure.leaves_low and self._low_null is not None:
             white = np.sqrt(self._low_null.hartlap_factor) * self._low_null.whiten_templates(made[:, self._low].T)
@@ -281,8 +286,30 @@ class Search:
 
     def _falls(self, scores: Vector) -> Vector:
         """Return the unbiased fall of chi^2 of every structure by itself."""
-        pairs = zip(self.grammar, self.nulls, strict=True)
-        return np.array([0.0 if n is None else n.hartlap_factor * n.chi2(w.of(scores)) for w, n in pairs])
+        found = np.zeros(len(self.grammar))
+        for k, (structure, null) in enumerate(zip(self.grammar, self.nulls, strict=True)):
+            if null is not None:
+                found[k] = null.hartlap_factor * null.chi2(structure.of(scores)) * self._share(k, scores)
+        return found
+
+    def _share(self, member: int, scores: Vector) -> float:
+        """Return how much of the fall of chi^2 that the scores of a variance promise is real.
+
+        Where numbers have 1 + a times the variance of the model, 2 ln L rises by a - ln(1 + a) for each of them, for
+        which their score says a^2/2: a bright pattern, which raises the variance too, would be noise first.
+        """
+        structure = self.grammar[member]
+        if structure.stage != "noise" and structure.kind != "power":
+            return 1.0
+        if structure.kind in ("power", "spectrum"):
+            rows, x = structure.of(self.simulations), structure.of(scores)
+            a = x / rows.mean(axis=0) - 1.0
+        else:
+            ((theta, _),) = self.fit([structure], scores)
+            pattern = theta if structure.mix is None else structure.mix.T @ theta
+            a = real.field(np.asarray(pattern), *healpy.pix2vec(COARSE, np.arange(12 * COARSE**2)))
+        a = np.maximum(a, LARGEST_FALL)
+        return float(2.0 * np.sum(a - np.log1p(a)) / np.sum(a**2)) if np.any(np.abs(a) > TINY) else 1.0
 
     def fit(self, chosen: Sequence[Structure], scores: Vector) -> list[tuple[Vector, Matrix]]:
         """Return the coordinates of structures, fitted together, and the covariance of each.

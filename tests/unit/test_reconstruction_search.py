@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 from mcsim.reconstruction.grammar import ALIKE, ANY, LOWEST, Structure
+from mcsim.reconstruction.plugin import CONSTANT
 from mcsim.reconstruction.search import ALTERNATIVES, LEVEL, MOST, Search, evidence
 
 
@@ -119,6 +120,21 @@ def test_monopoles_and_dipoles_that_a_modulation_makes_count():
     assert own_amplitudes[0][0] == pytest.approx(1e3, rel=0.05)
     (amplitude,) = search.amplitudes([modulation], x, made[:1])
     assert amplitude == pytest.approx(1.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(("stage", "kind", "unit"), [("noise", "level", 1.0 / CONSTANT), ("power", "power", 1.0)])
+def test_large_variances_are_judged_by_their_likelihood(stage, kind, unit):
+    """Of n numbers with 1 + a times their variance 2 ln L rises by n (a - ln(1 + a)), not by n a^2/2 as by a score."""
+    n, a = 500, 10.0
+    numbers = np.random.default_rng(2).normal(size=(400, n))
+    simulations = unit * 0.5 * np.sum(numbers**2, axis=1)[:, None]
+    place = np.array([[0]])
+    search = Search((Structure(stage, "", "", kind, "W1", ALIKE, None, place, np.ones(1), None, (0,)),), simulations)
+    (fall,) = search._falls((1.0 + a) * simulations.mean(axis=0))
+    assert fall == pytest.approx(n * (a - np.log1p(a)), rel=4.0 * np.sqrt(2.0 / 400))
+    assert fall < 0.4 * n * a**2 / 2.0
+    (fall,) = search._falls(simulations.mean(axis=0) + 3.0 * simulations.std(axis=0))
+    assert fall == pytest.approx(9.0, rel=0.2)
 
 
 def test_a_choice_among_many_is_charged():
