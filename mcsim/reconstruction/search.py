@@ -94,9 +94,6 @@ class Search:
         """Return the null distribution of every structure; None for one that the maps do not measure."""
         return tuple(self._null(one) for one in self.grammar)
 
-    def _rows(self, chosen: Sequence[int], scores: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.concatenate([self.grammar[k].of(scores) for k in chosen], axis=-1)
-
     def _null(self, structure: Structure) -> SimulatedGaussian | None:
         rows = structure.of(self.simulations)
         spread = rows.std(axis=0)
