@@ -16,6 +16,7 @@ from typing import Any
 import dask
 import pytest
 from distributed import Client, KilledWorker, LocalCluster
+from distributed.client import ClosedClientError, FutureCancelledError, FuturesCancelledError
 from distributed.comm.core import CommClosedError
 from distributed.diagnostics.plugin import WorkerPlugin
 from zarr.storage import _local
@@ -167,6 +168,33 @@ def test_workers_that_do_not_start_are_a_sentence(
         runner.run(table(), tmp_path / "x.zarr")
     assert not (tmp_path / "x.zarr").exists()
     assert not (tmp_path / "x.zarr.lock").exists()
+
+
+LOSSES = (FuturesCancelledError([]), FutureCancelledError("realize_chunk-0", "scheduler-connection-lost"))
+
+
+@pytest.mark.parametrize("error", [*LOSSES, ClosedClientError("closed"), CommClosedError("closed")], ids=repr)
+def test_a_scheduler_that_is_lost_during_a_task_is_a_sentence(
+    error: Exception, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lost(*_: Any, **__: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(cluster, "wait", lost)
+    with refused("scheduler", "x.zarr", by=RunError):
+        runner.run(table(), tmp_path / "x.zarr", workers=client)
+    with refused("scheduler", by=RunError):
+        list(runner.completed(client, pow, [(2, 3)]))
+
+
+@pytest.mark.parametrize("error", [OSError("Timed out trying to connect"), AttributeError("None has no ncores")])
+def test_a_scheduler_that_is_lost_between_tasks_is_a_sentence(error: Exception) -> None:
+    class Lost:
+        def nthreads(self) -> dict[str, int]:
+            raise error
+
+    with refused("scheduler", by=RunError):
+        list(runner.completed(Lost(), pow, [(2, 3)]))
 
 
 def test_summary_whose_workers_die_is_a_sentence(

@@ -1,7 +1,6 @@
 """Run of an ensemble: make, continue or extend a store, compute what is missing, summarise."""
 
 import os
-from asyncio import CancelledError
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -9,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from distributed import Client, KilledWorker
-from distributed.comm.core import CommClosedError
 
 from mcsim import config
 from mcsim.ensemble import plan, repair, store, summary
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.ensemble.lock import locked
-from mcsim.ensemble.runner.cluster import Roll, Workers, answers, check_workers, connected, death
+from mcsim.ensemble.runner.cluster import LOST, Roll, Workers, answers, check_workers, connected, death
 from mcsim.ensemble.tasks import Failure, Job, packages, realize_chunk, summarise_node
 from mcsim.errors import InputError, RunError
 from mcsim.simulation import power, simulate
@@ -178,7 +176,7 @@ def _run(client: Client, shared: Survey, target: Path, wanted: range, journal: J
         roll = Roll(client, journal)
         failures = _simulate(roll, target, run, wanted, journal)
         _summarise(roll, target, layout, journal.quiet)
-    except (KilledWorker, CancelledError, CommClosedError) as error:
+    except (KilledWorker, *LOST) as error:
         lost = "The connection to the scheduler is lost"
         reason = f"The summary cannot be made, for {death(error)}" if isinstance(error, KilledWorker) else lost
         raise RunError(f"{reason}; what is finished is stored in {target}, and the same command goes on.") from error

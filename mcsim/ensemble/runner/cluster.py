@@ -1,12 +1,13 @@
 """Workers: local or remote clusters, calls on them, and a record of who is present."""
 
+import asyncio
+import concurrent.futures
 import logging
 import multiprocessing
 import os
 import signal
 import sys
 import threading
-from asyncio import CancelledError
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.machinery import ModuleSpec
@@ -19,6 +20,7 @@ from uuid import uuid4
 
 import dask
 from distributed import Client, Future, KilledWorker, LocalCluster, wait
+from distributed.client import ClosedClientError
 from distributed.comm.core import CommClosedError, FatalCommClosedError
 from distributed.utils import get_mp_context
 
@@ -37,6 +39,9 @@ for name in set(os.environ) - {variables!r}:
 
 Workers = int | str | Client
 """Number of local processes, the address of a running scheduler, or a client, which is left open."""
+
+LOST = (asyncio.CancelledError, concurrent.futures.CancelledError, CommClosedError, ClosedClientError)
+"""Errors of a call whose scheduler is gone; the second is the parent of those that distributed raises for futures."""
 
 ANSWER_S = 5.0  #: time in which the scheduler at an address answers
 
@@ -255,11 +260,19 @@ class Roll:
 
     def __init__(self, client: Client, journal: Journal | None = None) -> None:
         self.client, self.journal = client, journal
-        self.there: dict[str, int] = client.nthreads()
+        self.there = self._threads()
+
+    def _threads(self) -> dict[str, int]:
+        """Return the number of threads of each worker; raise CommClosedError if the scheduler does not answer."""
+        try:
+            found: dict[str, int] = self.client.nthreads()
+        except (OSError, AttributeError) as error:  # AttributeError: the client has closed itself
+            raise CommClosedError(f"the scheduler does not answer ({error})") from error
+        return found
 
     def call(self) -> int:
         """Return the number of threads of the present workers; replace lost ones of a local cluster."""
-        now, cluster = self.client.nthreads(), self.client.cluster
+        now, cluster = self._threads(), self.client.cluster
         if isinstance(cluster, LocalCluster) and len(now) < len(cluster.worker_spec):
             # A nanny gives up if its worker dies during the start.
             cluster.scale(len(cluster.worker_spec))
@@ -309,7 +322,7 @@ def completed(
             if killed is not None:
                 raise RunError(f"A task was given up, for {death(killed)}; give workers more memory.") from killed
             yield index, result
-    except (CancelledError, CommClosedError) as error:
+    except LOST as error:
         raise RunError("The connection to the scheduler is lost; run the same command again.") from error
 
 
