@@ -164,10 +164,12 @@ def fit_models(
 
     InputError as well for no model or a repeated one.
     """
-    if isinstance(names, str):
-        raise InputError(f"models = {names!r} is no list of models; give one, such as [{names!r}].")
-    if not names or len(set(names)) < len(names):
-        raise InputError(f"the models {', '.join(names) or '(none)'} are not different ones; name each model once.")
+    if isinstance(names, str) or not isinstance(names, Sequence):
+        such = names if isinstance(names, str) else "constant"
+        raise InputError(f"models = {names!r} is no list of models; give one, such as [{such!r}].")
+    if not names or any(names.count(name) > 1 for name in names):
+        said = ", ".join(map(str, names)) or "(none)"
+        raise InputError(f"the models {said} are not different ones; name each model once.")
     made = templates(survey_of(source, nthreads), measured, nthreads)
     fits = [_fit(made, name, knots, order) for name in names]
     if len({one.order for one in fits}) > 1:

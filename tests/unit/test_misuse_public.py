@@ -48,6 +48,13 @@ def test_a_width_is_one_plain_number(width) -> None:
         Beam.elliptical(70.0, width, lmax=LMAX)
 
 
+@pytest.mark.parametrize("width", [-1, 0.0, 1201.0, float("nan")])
+def test_a_width_that_cannot_be_is_called_by_its_own_name(width) -> None:
+    with refused("fwhm_arcmin", width, 1200) as caught:
+        Beam.gaussian(width, lmax=LMAX)
+    assert "major" not in str(caught.value)
+
+
 def test_a_number_of_threads_is_a_number(tmp_path) -> None:
     with refused("nthreads", "'2'"):
         mcsim.write_maps(run(), tmp_path / "maps", nthreads="2")
@@ -207,6 +214,13 @@ def test_a_column_of_the_square_is_no_beam(column, tmp_path) -> None:
         (lambda: mcsim.predict(run(), L_moments=2.5), ("L_moments", 2.5)),
         (lambda: mcsim.predict(run(), nthreads="2"), ("nthreads", "'2'")),
         (lambda: fit_models(None, None, "constant"), ("models", "'constant'")),
+        (lambda: fit_models(None, None, None), ("models", None)),
+        (lambda: fit_models(None, None, 5), ("models", 5)),
+        (lambda: fit_models(None, None, [["linear"], ["linear"]]), ("models", "['linear']")),
+        (lambda: Beam.from_map(np.zeros((0, 0)), LMAX, pixel_deg=0.2), ("(0, 0)",)),
+        (lambda: Beam.from_map(np.zeros((0, 5)), LMAX, pixel_deg=0.2, centre=(2, 0)), ("(0, 5)",)),
+        (lambda: Beam.gaussian(600.0, lmax=LMAX).values(np.nan, 0.0), ("theta",)),
+        (lambda: Beam.gaussian(600.0, lmax=LMAX).values(0.0, np.inf), ("phi",)),
         (lambda: mcsim.ScanModel.load("wmap").with_sampling(1e-9), ("1e-09", "3.16e+16", "sample_period_s")),
         (lambda: mcsim.merge(None, "x.zarr"), ("paths", None)),
         (lambda: mcsim.run(run(), realizations=slice("0", "3")), ("realizations",)),

@@ -13,9 +13,9 @@ from mcsim.errors import InputError
 from mcsim.instrument.beams.beammap import DEFAULT_CUT_DEG, BeamMap, placed, read_map
 from mcsim.instrument.beams.coefficients import check_mmax, choose_mmax, cut, power_by_order
 from mcsim.instrument.beams.files import checked_blm
-from mcsim.instrument.beams.gaussian import elliptical_blm
+from mcsim.instrument.beams.gaussian import check_fwhm, elliptical_blm
 from mcsim.instrument.beams.window import read_window
-from mcsim.sphere.checks import check_angle, check_finite, check_number, check_shape, check_whole
+from mcsim.sphere.checks import check_angle, check_finite, check_shape, check_whole
 from mcsim.support.arrays import reals
 from mcsim.support.folders import unwritable, user_path
 from mcsim.support.npy import read_npz
@@ -95,7 +95,7 @@ class Beam:
         >>> print(f"{Beam.gaussian(30.0, lmax=200).window[200]:.4f}")
         0.7588
         """
-        check_number(fwhm_arcmin, "fwhm_arcmin", "arcmin")
+        check_fwhm(fwhm_arcmin, "fwhm_arcmin")
         return cls.elliptical(fwhm_arcmin, fwhm_arcmin, lmax=lmax, mmax=0)
 
     @classmethod
@@ -401,6 +401,8 @@ class Beam:
         """
         theta, phi = reals(theta, "theta"), reals(phi, "phi")
         check_shape(phi, theta.shape, "phi")
+        check_finite(theta, "theta")
+        check_finite(phi, "phi")
         check_whole(nthreads, "nthreads")
         if np.any((theta < 0.0) | (theta > np.pi)):
             raise InputError("theta must lie between 0 and pi radians: give the angle from the centre of the beam.")

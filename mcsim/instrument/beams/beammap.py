@@ -120,6 +120,8 @@ def placed(
         raise InputError(f"projection = {projection!r} is not one of {', '.join(get_args(Projection))}")
     if image.ndim != 2:
         raise InputError(f"{origin} has {image.ndim} dimensions where a beam map has 2: rows along y, columns along x")
+    if not image.size:
+        raise InputError(f"{origin} has shape {image.shape}, without a pixel: give a map of the peak and its wings")
     for name, value in (("pixel_deg", pixel_deg), ("cut_deg", cut_deg)):
         check_number(value, name, "degrees")
     pixel = np.radians(pixel_deg)

@@ -14,6 +14,13 @@ MAX_FWHM_ARCMIN = 1200.0
 _LARGEST_ORDER = 64
 
 
+def check_fwhm(width: float, name: str) -> None:
+    """Raise InputError unless a full width at half maximum in arcmin is one that is offered."""
+    check_number(width, name, "arcmin")
+    if not 0 < width <= MAX_FWHM_ARCMIN:
+        raise InputError(f"{name} = {width} must be above 0 and at most {MAX_FWHM_ARCMIN:g} arcmin")
+
+
 def elliptical_blm(
     fwhm_major_arcmin: float, fwhm_minor_arcmin: float, angle_deg: float, lmax: int, mmax: int | None = None
 ) -> NDArray[np.complex128]:
@@ -50,10 +57,8 @@ def elliptical_blm(
     With (l + 1/2)^2 the second row is 3e-5 at m = 2 instead, whichever of the two beams is meant.
     """
     check_lmax(lmax)
-    for name, width in (("fwhm_major_arcmin", fwhm_major_arcmin), ("fwhm_minor_arcmin", fwhm_minor_arcmin)):
-        check_number(width, name, "arcmin")
-        if not 0 < width <= MAX_FWHM_ARCMIN:
-            raise InputError(f"{name} = {width} must be above 0 and at most {MAX_FWHM_ARCMIN:g} arcmin")
+    check_fwhm(fwhm_major_arcmin, "fwhm_major_arcmin")
+    check_fwhm(fwhm_minor_arcmin, "fwhm_minor_arcmin")
     if fwhm_major_arcmin < fwhm_minor_arcmin:
         raise InputError(
             f"fwhm_major_arcmin = {fwhm_major_arcmin} is less than fwhm_minor_arcmin = {fwhm_minor_arcmin}: "
