@@ -16,6 +16,7 @@ Identity = tuple[str, str | None]  #: name of an effect and of its channel; None
 Answer = frozenset[Identity]  #: effects that act together; the empty set: no effect
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
+LARGEST = 1e100  #: share or expected S/N whose square is a number, too
 IN_LIBRARY = ("none", "one", "two")  #: kinds of cases whose effects the diagnosis can name
 
 
@@ -37,6 +38,9 @@ class Prior:
 
     def __post_init__(self) -> None:
         """Raise InputError for strengths or shares that cannot be drawn."""
+        for name, value in vars(self).items():
+            if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+                raise InputError(f"{name} is {value!r}, but it must be a number of at most {LARGEST:g}; give one.")
         if not 0.0 < self.weakest < self.strongest:
             raise InputError(
                 f"an expected S/N from {self.weakest:g} to {self.strongest:g} is no range; give two numbers above 0, "

@@ -319,6 +319,10 @@ def test_drawn_effects_are_possible():
 def test_a_prior_that_is_none_is_refused(wrong):
     with pytest.raises(InputError):
         Prior(**wrong)
+    for name in ("weakest", "strongest", "two"):
+        for value in (float("inf"), 1e300, float("nan"), "20"):
+            with refused(name, value):
+                Prior(**{name: value})
     with pytest.raises(InputError):
         Prior(none=0, one=0, two=0, left_out=0)
 
