@@ -1,37 +1,19 @@
 """Challenges on toys: seals, draws, the best classifier, and what the score makes of records."""
 
-import tomllib
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import tomli_w
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import integrate, stats
 
 from mcsim import config, systematics
 from mcsim.benchmark.bayes import BayesClassifier
-from mcsim.benchmark.case import Drawn, Member, Prior, Record, Truth, pulls
-from mcsim.benchmark.challenge import _without_none, make, run
-from mcsim.benchmark.folder import (
-    MAPS,
-    SEAL,
-    SETTINGS,
-    VERDICTS,
-    Settings,
-    finished_cases,
-    key_hash,
-    key_path,
-    open_key,
-    read_key,
-    write_key,
-)
+from mcsim.benchmark.case import Drawn, Member, Prior, Record, pulls
 from mcsim.benchmark.models import linear_model, reduced, simulated
 from mcsim.benchmark.report import lines, write
 from mcsim.benchmark.sampler import CaseSampler
-from mcsim.benchmark.score import Draw, _is_named, draws, judge, powers, score, score_draws
+from mcsim.benchmark.score import Draw, _is_named, draws, judge, powers
 from mcsim.benchmark.summary import Score, any_place_right, confusion
 from mcsim.datavector.analysis import Analysis, Job
 from mcsim.datavector.campaign import batch
@@ -42,7 +24,6 @@ from mcsim.datavector.summaries import Block, Element
 from mcsim.diagnosis.context import context
 from mcsim.errors import InputError
 from mcsim.stats.look_elsewhere import global_test
-from mcsim.support.folders import write_whole
 from mcsim.systematics.signatures import SIGNATURES
 from refusals import refused
 
@@ -100,133 +81,6 @@ def linear(learned):
 def member(name="beam_width", channel="A", **changes):
     values = {"parameters": {"amplitude": 0.01}, "coordinates": (0.01,), "strength": 6.0, "candidate": 0}
     return Member(name, channel, **(values | changes))
-
-
-def truth(case="case-000", **changes):
-    values = {"kind": "one", "members": (member(),), "without": (), "seed": 5, "sampled": True, "nonce": "ab" * 32}
-    return Truth(case=case, **(values | changes))
-
-
-# The folder of a challenge
-
-
-@pytest.fixture
-def folder(tmp_path):
-    """A challenge of one case, without maps."""
-    Settings(config.load("quickstart")).write(tmp_path, 3)
-    write_key(tmp_path, truth())
-    seal(tmp_path, key_hash(tmp_path, "case-000"))
-    return tmp_path
-
-
-def seal(folder, text):
-    (folder / MAPS / "case-000").mkdir(parents=True, exist_ok=True)
-    (folder / MAPS / "case-000" / SEAL).write_text(f"{text}  keys/case-000.json\n")
-
-
-effects = st.builds(
-    Member,
-    st.text(),
-    st.none() | st.text(),
-    st.dictionaries(st.text(), st.floats(allow_nan=False) | st.booleans() | st.text()),
-    st.lists(st.floats(allow_nan=False)).map(tuple),
-    st.floats(0, 100),
-    st.none() | st.integers(0, 99),
-    st.lists(st.floats(allow_nan=False)).map(tuple),
-)
-
-
-@given(st.lists(effects, max_size=2), st.lists(st.text(), max_size=2), st.integers(2**40, 2**62), st.booleans())
-def test_a_key_is_read_as_it_was_written(tmp_path_factory, members, without, seed, by_sample):
-    folder = tmp_path_factory.mktemp("keys")
-    written = truth(members=tuple(members), without=tuple(without), seed=seed, sampled=by_sample)
-    write_key(folder, written)
-    seal(folder, key_hash(folder, "case-000"))
-    assert read_key(folder, "case-000") == open_key(folder, "case-000") == written
-
-
-def test_effects_on_request_are_settings_of_a_challenge(tmp_path):
-    asked = Settings(config.load("quickstart"), including=("gain_spin",))
-    asked.write(tmp_path, 3)
-    assert Settings.read(tmp_path) == asked
-    with pytest.raises(InputError):
-        Settings(config.load("quickstart")).write(tmp_path, 3)
-    with refused("gain_spinn", "gain_spin"):
-        replace(asked, including=("gain_spinn",))
-
-
-def test_settings_are_read_as_they_were_written(folder):
-    found = Settings.read(folder)
-    assert found == Settings(config.load("quickstart"))
-    found.write(folder, 3)
-    for other, seed in ((found, 4), (replace(found, sampled_share=0.1), 3)):
-        with pytest.raises(InputError):
-            other.write(folder, seed)
-
-
-def test_a_key_that_was_changed_is_found(folder):
-    assert finished_cases(folder) == ["case-000"]
-    assert open_key(folder, "case-000") == truth()
-    write_key(folder, truth(kind="none", members=()))
-    with refused("case-000.json", "SHA-256"):
-        open_key(folder, "case-000")
-    seal(folder, "")
-    with refused("case-000.json", "SHA-256"):
-        open_key(folder, "case-000")
-    for text in ("{}", "[1]", "no key", '{"schema": 1, "members": [{"name": "beam_width"}], "without": []}'):
-        key_path(folder, "case-000").write_text(text)
-        with pytest.raises(InputError):
-            open_key(folder, "case-000")
-    key_path(folder, "case-000").unlink()
-    with pytest.raises(InputError):
-        open_key(folder, "case-000")
-
-
-def test_a_folder_that_is_no_challenge_is_refused(folder, tmp_path):
-    for task in (run, score):
-        with refused(tmp_path / "nothing"):
-            task(tmp_path / "nothing", workers=0)
-    with refused(tmp_path, "verdicts"):
-        score(folder, workers=0)
-    with refused("question.json"):
-        run(folder, workers=0)
-    (folder / VERDICTS / "case-000").mkdir(parents=True)
-    for text in ("{}", "no settings", '{"model": 3, "prior": {}, "sampled_share": 0.5, "simulations": null}'):
-        write_whole(folder / SETTINGS, text)
-        for task in (run, score):
-            with pytest.raises(InputError):
-                task(folder, workers=0)
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
-def test_a_share_is_from_nothing_to_all(share):
-    with refused(share):
-        Settings(config.load("quickstart"), sampled_share=share)
-
-
-@pytest.mark.parametrize("number", [0, -3])
-def test_a_number_of_cases_is_positive(number, tmp_path):
-    settings = Settings(config.load("quickstart"), sampled_share=0.0)
-    with refused(number):
-        make(settings, tmp_path / "made", number, 0, workers=0)
-    with refused(number):
-        score_draws(settings, tmp_path / "made", number, 0, workers=0)
-    assert not (tmp_path / "made").exists()
-
-
-def test_a_score_of_draws_is_written_over_nothing(tmp_path):
-    (tmp_path / "score.json").write_text("of a challenge")
-    with refused(tmp_path, "-o"):
-        score_draws(Settings(config.load("quickstart"), sampled_share=0.0), tmp_path, 2, 0, workers=0)
-    assert [path.name for path in tmp_path.iterdir()] == ["score.json"]
-
-
-@pytest.mark.parametrize("name", ["plain", 'quotes " and #', "beam \N{TELESCOPE}"])
-def test_a_run_in_toml_loads_as_the_same_run(name):
-    run = config.load("quickstart")
-    effect = config.Effect(name="beam_width", channel=run.channels[0].name, parameters={"amplitude": 0.01})
-    run = replace(run, name=name, effects=(effect,))
-    assert config.load(tomllib.loads(tomli_w.dumps(_without_none(config.to_dict(run))))) == run
 
 
 # Draws
