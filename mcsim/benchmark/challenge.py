@@ -88,8 +88,7 @@ def make_case(settings: Settings, folder: Path, truth: Truth) -> None:
         members = truth.members
         if truth.kind != "invented":
             members = tuple(_measured(learned_model(settings), member, truth.seed) for member in members)
-        truth = replace(truth, members=members, nonce=secrets.token_hex(32))
-        files.write_key(folder, truth)
+        truth = files.write_key(folder, replace(truth, members=members, nonce=secrets.token_hex(32)))
     with appearing(folder / files.MAPS / case) as scratch:
         for name, map_uk in maps_of(run, truth, settings.out_of_library):
             write_map(scratch / names[name], map_uk, config.prepared_grid(run)[1], [POINTING[truth.sampled]])

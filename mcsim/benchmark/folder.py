@@ -10,7 +10,7 @@ from mcsim import config
 from mcsim.benchmark.case import Member, Prior, Truth
 from mcsim.benchmark.out_of_library import load
 from mcsim.errors import InputError
-from mcsim.support.folders import write_whole
+from mcsim.support.folders import write_once
 from mcsim.systematics import get
 
 SETTINGS, MAPS, KEYS, SEAL, VERDICTS = "challenge.json", "cases", "keys", "SEAL", "verdicts"
@@ -55,9 +55,8 @@ class Settings:
         plain |= {"including": list(self.including)} if self.including else {}
         for path, content in ((folder / SETTINGS, plain), (folder / KEYS / SETTINGS, {"seed": seed})):
             text = json.dumps(content, indent=1, sort_keys=True) + "\n"
-            if not path.is_file():
-                write_whole(path, text)
-            elif path.read_text() != text:
+            write_once(path, text)
+            if path.read_text() != text:
                 raise InputError(f"{path} is of a challenge with other settings; use those again, or another folder.")
 
     @classmethod
@@ -85,9 +84,10 @@ def key_path(folder: Path, case: str) -> Path:
     return folder / KEYS / f"{case}.json"
 
 
-def write_key(folder: Path, truth: Truth) -> None:
-    """Write the key of a case."""
-    write_whole(key_path(folder, truth.case), json.dumps({"schema": 1, **asdict(truth)}, indent=1) + "\n")
+def write_key(folder: Path, truth: Truth) -> Truth:
+    """Write the key of a case, unless it has one; return the one that it has: nobody else's seal is broken."""
+    write_once(key_path(folder, truth.case), json.dumps({"schema": 1, **asdict(truth)}, indent=1) + "\n")
+    return read_key(folder, truth.case)
 
 
 def read_key(folder: Path, case: str) -> Truth:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 from mcsim.errors import InputError, RunError
 
@@ -73,10 +74,26 @@ def unreadable(name: str | Path, what: str, remedy: str) -> Iterator[None]:
 
 def write_whole(path: Path, text: str) -> None:
     """Write a file that appears complete or not at all."""
+    with _written_beside(path, text) as scratch:
+        os.replace(scratch, path)
+
+
+def write_once(path: Path, text: str) -> None:
+    """Write a file that appears complete or not at all, unless it is there: of several writers one, and it alone."""
+    with _written_beside(path, text) as scratch, suppress(FileExistsError):
+        os.link(scratch, path)
+
+
+@contextmanager
+def _written_beside(path: Path, text: str) -> Iterator[Path]:
+    """Yield a file with this text beside ``path``; delete it if it is still there at the end."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    scratch.write_text(text)
-    os.replace(scratch, path)
+    scratch = path.with_name(f".{path.name}.{uuid4().hex}")
+    try:
+        scratch.write_text(text)
+        yield scratch
+    finally:
+        scratch.unlink(missing_ok=True)
 
 
 def writable(folder: Path) -> None:

@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcsim import config
+from mcsim.benchmark import challenge
 from mcsim.benchmark.case import Member, Truth
-from mcsim.benchmark.challenge import _without_none, make, run
+from mcsim.benchmark.challenge import _without_none, make, make_case, run
 from mcsim.benchmark.folder import (
     MAPS,
     SEAL,
@@ -94,6 +95,7 @@ def test_settings_are_read_as_they_were_written(folder):
 def test_a_key_that_was_changed_is_found(folder):
     assert finished_cases(folder) == ["case-000"]
     assert open_key(folder, "case-000") == truth()
+    key_path(folder, "case-000").unlink()
     write_key(folder, truth(kind="none", members=()))
     with refused("case-000.json", "SHA-256"):
         open_key(folder, "case-000")
@@ -107,6 +109,26 @@ def test_a_key_that_was_changed_is_found(folder):
     key_path(folder, "case-000").unlink()
     with pytest.raises(InputError):
         open_key(folder, "case-000")
+
+
+def test_a_key_is_written_once(tmp_path):
+    """Of two makers of a case the later one takes the key of the earlier: its seal is that of the one key there is."""
+    assert write_key(tmp_path, truth(nonce="ab" * 32)) == truth(nonce="ab" * 32)
+    assert write_key(tmp_path, truth(nonce="cd" * 32)) == truth(nonce="ab" * 32)
+    assert [path.name for path in key_path(tmp_path, "case-000").parent.iterdir()] == ["case-000.json"]
+
+
+def test_a_case_that_two_make_at_once_has_the_seal_of_its_key(tmp_path, monkeypatch):
+    settings, drawn = Settings(config.load("tiny")), truth(members=(), sampled=False)
+
+    def slow(bits):
+        monkeypatch.setattr(challenge.secrets, "token_hex", lambda bits: "ab" * 32)
+        make_case(settings, tmp_path, drawn)
+        return "cd" * 32
+
+    monkeypatch.setattr(challenge.secrets, "token_hex", slow)
+    make_case(settings, tmp_path, drawn)
+    assert open_key(tmp_path, "case-000").nonce == "ab" * 32
 
 
 def test_a_folder_that_is_no_challenge_is_refused(folder, tmp_path):
