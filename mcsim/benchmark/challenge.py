@@ -2,6 +2,7 @@
 
 import json
 import secrets
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -55,8 +56,10 @@ def make(
     for channel in survey(settings.model).channels if settings.sampled_share > 0.0 or file else ():
         sampled.check(channel)
     writable(target)
+    names = [f"case-{number:03d}" for number in range(cases)]
+    files.check_keys(target, names)
     settings.write(target, seed)
-    missing = [number for number in range(cases) if not (target / files.MAPS / f"case-{number:03d}").is_dir()]
+    missing = [number for number, case in enumerate(names) if not files.is_finished(target, case)]
     if not missing:
         return target
     with workers_of(settings, workers, quiet) as call:
@@ -79,7 +82,10 @@ def _truth(drawn: Drawn, seed: int, number: int, sampled_share: float) -> Truth:
 
 
 def make_case(settings: Settings, folder: Path, truth: Truth) -> None:
-    """Make maps, seal and key of one case: the key first; the folder of the maps, complete, last."""
+    """Make maps, seal and key of one case: the key first; the folder of the maps, complete, last.
+
+    It takes the place of one that has lost its seal.
+    """
     case, run = truth.case, settings.model
     names = file_names(run)
     if files.key_path(folder, case).is_file():
@@ -96,6 +102,8 @@ def make_case(settings: Settings, folder: Path, truth: Truth) -> None:
         (scratch / "model.toml").write_text(tomli_w.dumps(_without_none(plain)), encoding="utf-8")
         (scratch / "question.json").write_text(json.dumps({"without": list(truth.without)}) + "\n")
         (scratch / files.SEAL).write_text(f"{files.key_hash(folder, case)}  {files.KEYS}/{case}.json\n")
+        if not files.is_finished(folder, case):
+            shutil.rmtree(folder / files.MAPS / case, ignore_errors=True)
 
 
 def maps_of(run: config.RunConfig, truth: Truth, file: str | None = None) -> list[tuple[str, Vector]]:
@@ -142,14 +150,14 @@ def _without_none(value: Any) -> Any:
 
 
 def run(folder: str | Path, *, workers: Workers | None = None, quiet: bool = True) -> int:
-    """Diagnose the cases of a challenge that have no verdict yet, without looking at the keys; return their number.
+    """Diagnose the cases of a challenge that have no verdict yet, without opening the keys; return their number.
 
     The folder, filled by :func:`make`, gets ``verdicts/case-NNN`` with ``verdict.json`` and ``answer.json`` (the data
     vector and the fits behind the verdict). ``workers`` as for :func:`make`.
-    InputError if the folder holds no challenge.
+    InputError if the folder holds no challenge, or cases that have keys are lost.
     """
     target = Path(folder)
-    missing = [case for case in files.finished_cases(target) if not (target / files.VERDICTS / case).is_dir()]
+    missing = [case for case in files.all_cases(target) if not (target / files.VERDICTS / case).is_dir()]
     settings = Settings.read(target)
     if missing:
         # Cases of one library follow each other, so that a worker seldom changes its library.

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from mcsim.errors import InputError
 from mcsim.support.folders import write_once
 from mcsim.systematics import get
 
+NO_KEY = "restore it, or make another challenge in a new folder"
 SETTINGS, MAPS, KEYS, SEAL, VERDICTS = "challenge.json", "cases", "keys", "SEAL", "verdicts"
 
 
@@ -93,7 +95,7 @@ def write_key(folder: Path, truth: Truth) -> Truth:
 def read_key(folder: Path, case: str) -> Truth:
     """Read what :func:`write_key` wrote; InputError if it is no key."""
     path = key_path(folder, case)
-    plain = read_json(path, "restore the key, or make the challenge again")
+    plain = read_json(path, NO_KEY)
     try:
         del plain["schema"]
         for member in plain["members"]:
@@ -101,7 +103,7 @@ def read_key(folder: Path, case: str) -> Truth:
         members = tuple(Member(**member) for member in plain.pop("members"))
         return Truth(members=members, without=tuple(plain.pop("without")), **plain)
     except (KeyError, TypeError) as error:
-        raise InputError(f"{path} cannot be read as a key ({error}); make the challenge again.") from error
+        raise InputError(f"{path} cannot be read as a key ({error}); {NO_KEY}.") from error
 
 
 def key_hash(folder: Path, case: str) -> str:
@@ -126,4 +128,36 @@ def finished_cases(folder: Path) -> list[str]:
     cases = folder / MAPS
     if not cases.is_dir():
         raise InputError(f"{folder} holds no challenge; make one with mcsim challenge make.")
-    return sorted(path.name for path in cases.iterdir() if (path / SEAL).is_file() and not path.name.startswith("."))
+    return sorted(path.name for path in cases.iterdir() if is_finished(folder, path.name) and path.name[:1] != ".")
+
+
+def is_finished(folder: Path, case: str) -> bool:
+    """Return True if the maps of a case are complete: the seal is written last."""
+    return (folder / MAPS / case / SEAL).is_file()
+
+
+def all_cases(folder: Path) -> list[str]:
+    """Return :func:`finished_cases`; InputError that names cases with key or verdict whose maps or seal are lost."""
+    found = finished_cases(folder)
+    known = {path.stem for path in (folder / KEYS).glob("case-*.json")}
+    known |= {path.name for path in (folder / VERDICTS).glob("case-*")}
+    if lost := sorted(known - set(found)):
+        raise InputError(
+            f"{folder / MAPS} lacks {listed(lost)}, maps or {SEAL}, and a score without them would be of chosen cases; "
+            "restore them, or give mcsim challenge make again."
+        )
+    return found
+
+
+def check_keys(folder: Path, cases: Iterable[str]) -> None:
+    """Raise InputError if finished cases have no key: one with another nonce would not be the sealed one."""
+    if lost := [case for case in cases if is_finished(folder, case) and not key_path(folder, case).is_file()]:
+        raise InputError(
+            f"{folder / KEYS} lacks the keys of {listed(lost)}, which cannot be made again; restore them, or make "
+            "another challenge in a new folder."
+        )
+
+
+def listed(cases: Sequence[str]) -> str:
+    """Return the names of the first cases, and how many there are more."""
+    return ", ".join(cases[:5]) + (f" and {len(cases) - 5} more" if len(cases) > 5 else "")

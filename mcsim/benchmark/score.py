@@ -10,7 +10,7 @@ import numpy as np
 from mcsim.benchmark import report
 from mcsim.benchmark.bayes import BayesClassifier, facts
 from mcsim.benchmark.case import Drawn, Prior, Record, Truth, pulls
-from mcsim.benchmark.folder import VERDICTS, Settings, finished_cases, open_key, read_json
+from mcsim.benchmark.folder import VERDICTS, Settings, all_cases, open_key, read_json
 from mcsim.benchmark.models import EffectsLibrary, LinearModel, learned_model, linear_model, simulated, workers_of
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.benchmark.summary import ALPHA, Power, Score
@@ -38,10 +38,10 @@ def score(folder: str | Path, *, workers: Workers | None = None, quiet: bool = T
 
     The folder gets ``score/score.json``, ``score/report.html`` and ``score/score.png``. ``workers`` are the processes
     that learn the model again, should it not be in the cache (:func:`mcsim.benchmark.challenge.make`). InputError if
-    there is no verdict, or one cannot be read, or a key is not the sealed one.
+    there is no verdict, or one cannot be read, or a key is not the sealed one, or cases that have keys are lost.
     """
     target = Path(folder)
-    made = finished_cases(target)
+    made = all_cases(target)
     cases = [case for case in made if (target / VERDICTS / case).is_dir()]
     if not cases:
         raise InputError(f"{folder} has no verdicts; run mcsim challenge run {folder} first.")

@@ -154,6 +154,35 @@ def test_a_case_without_a_verdict_is_counted(challenge, tmp_path):
     (tmp_path / "case-003").rename(folder / "verdicts" / "case-003")
 
 
+@pytest.mark.parametrize("lost", ["case-001/SEAL", "case-001"])
+def test_a_lost_case_is_named_and_not_left_out_of_the_score(challenge, tmp_path, lost):
+    folder, _ = challenge
+    run(folder, workers=0)
+    case = folder / "cases" / "case-001"
+    before = {path.name: path.read_bytes() for path in case.iterdir() if path.suffix != ".fits"}
+    (folder / "cases" / lost).rename(tmp_path / "lost")
+    for task in (run, score.score):
+        with refused("case-001", "SEAL"):
+            task(folder, workers=0)
+    made(folder)
+    assert {path.name: path.read_bytes() for path in case.iterdir() if path.suffix != ".fits"} == before
+    assert len(list(case.glob("*.fits"))) == 2
+    assert run(folder, workers=0) == 0
+
+
+def test_a_lost_key_is_named_and_no_other_made(challenge, tmp_path):
+    folder, _ = challenge
+    (folder / "keys").rename(tmp_path / "keys")
+    with refused(folder / "keys", "case-000", "case-004"):
+        made(folder)
+    assert not (folder / "keys").exists()
+    run(folder, workers=0)  # needs no keys
+    with refused("case-000.json") as caught:
+        score.score(folder, workers=0)
+    assert "new folder" in str(caught.value)
+    (tmp_path / "keys").rename(folder / "keys")
+
+
 def test_the_catalogue_stays_what_it_is():
     assert set(load(OUT_OF_LIBRARY)) == {"invented_square_beam", "invented_nonlinearity", "invented_crosstalk"}
     assert "invented_crosstalk" in library_with(OUT_OF_LIBRARY)
