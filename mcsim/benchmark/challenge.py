@@ -100,7 +100,7 @@ def make_case(settings: Settings, folder: Path, truth: Truth) -> None:
             write_map(scratch / names[name], map_uk, config.prepared_grid(run)[1], [POINTING[truth.sampled]])
         plain = {**config.to_dict(run), "name": case}
         (scratch / "model.toml").write_text(tomli_w.dumps(_without_none(plain)), encoding="utf-8")
-        (scratch / "question.json").write_text(json.dumps({"without": list(truth.without)}) + "\n")
+        (scratch / files.QUESTION).write_text(json.dumps({"without": list(truth.without)}) + "\n")
         (scratch / files.SEAL).write_text(f"{files.key_hash(folder, case)}  {files.KEYS}/{case}.json\n")
         if not files.is_finished(folder, case):
             shutil.rmtree(folder / files.MAPS / case, ignore_errors=True)
@@ -161,7 +161,7 @@ def run(folder: str | Path, *, workers: Workers | None = None, quiet: bool = Tru
     settings = Settings.read(target)
     if missing:
         # Cases of one library follow each other, so that a worker seldom changes its library.
-        ordered = sorted((_without(target, case), case) for case in missing)
+        ordered = sorted((files.question(settings, target, case), case) for case in missing)
         with workers_of(settings, workers, quiet) as call:
             _each_case(call, diagnose_case, [(settings, target, case, names) for names, case in ordered], quiet)
     return len(missing)
@@ -171,8 +171,9 @@ def diagnose_case(settings: Settings, folder: Path, case: str, without: tuple[st
     """Write the verdict of one case; its folder appears complete or not at all."""
     model = learned_model(settings, without)
     seen = model.context.analysis.model, folder / files.MAPS / case
+    maps = read_maps(*seen)  # first, as it says what is wrong with them
     known = model.context.of_pixel_means if of_pixel_means(*seen) else model.context
-    found = diagnose_data(ObservedMaps(known, read_maps(*seen), model.simulate), case)
+    found = diagnose_data(ObservedMaps(known, maps, model.simulate), case)
     answer = {
         "evidence": [float(value) for value in found.data],
         "maximum": found.test.maximum,
@@ -195,11 +196,3 @@ def _each_case(call: Batch, task: Callable[..., None], arguments: Sequence[tuple
     with reporting("cases", float(len(arguments)), "cases", quiet) as report:
         for done, _ in enumerate(call(task, arguments), 1):
             report(float(done))
-
-
-def _without(folder: Path, case: str) -> tuple[str, ...]:
-    path = folder / files.MAPS / case / "question.json"
-    try:
-        return tuple(files.read_json(path, "restore it")["without"])
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{path} does not say which effects are left out ({error}); restore it.") from error

@@ -2,20 +2,21 @@
 
 import hashlib
 import json
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mcsim import config
+from mcsim import config, systematics
 from mcsim.benchmark.case import Member, Prior, Truth
 from mcsim.benchmark.out_of_library import load
 from mcsim.errors import InputError
 from mcsim.support.folders import write_once
-from mcsim.systematics import get
 
 NO_KEY = "restore it, or make another challenge in a new folder"
 SETTINGS, MAPS, KEYS, SEAL, VERDICTS = "challenge.json", "cases", "keys", "SEAL", "verdicts"
+QUESTION = "question.json"
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Settings:
     def __post_init__(self) -> None:
         """Raise InputError for a share outside 0 to 1, or an effect that there is not."""
         for name in self.including:
-            get(name)
+            systematics.get(name)
         if not 0.0 <= self.sampled_share <= 1.0:
             raise InputError(f"a share of {self.sampled_share:g} made sample by sample is none; give 0 to 1.")
 
@@ -114,13 +115,27 @@ def key_hash(folder: Path, case: str) -> str:
 def open_key(folder: Path, case: str) -> Truth:
     """Read the key of a case; InputError if it has changed since its hash was published with the maps."""
     truth = read_key(folder, case)
-    seal = (folder / MAPS / case / SEAL).read_text().split()
-    if seal[:1] != [key_hash(folder, case)]:
+    path = folder / MAPS / case / SEAL
+    seal = path.read_bytes().split()[:1]
+    if not seal or re.fullmatch(rb"[0-9a-f]{64}", seal[0]) is None:
+        raise InputError(f"{path} does not begin with a SHA-256 of 64 hexadecimal digits; restore it.")
+    if seal != [key_hash(folder, case).encode()]:
         raise InputError(
             f"{key_path(folder, case)} is not the key that was sealed: its SHA-256 is not that of {case}/{SEAL}; "
             "restore it."
         )
     return truth
+
+
+def question(settings: Settings, folder: Path, case: str) -> tuple[str, ...]:
+    """Return the effects that the diagnosis of a case must not propose; InputError if the folder does not say so."""
+    path = folder / MAPS / case / QUESTION
+    plain = read_json(path, "restore it")
+    names = plain.get("without") if isinstance(plain, dict) else None
+    known = {*systematics.catalogue(), *(systematics.get(name).name for name in settings.including)}
+    if not isinstance(names, list) or not all(isinstance(name, str) and name in known for name in names):
+        raise InputError(f'{path} must have a list "without" of names of effects, not {names!r}; restore it.')
+    return tuple(names)
 
 
 def finished_cases(folder: Path) -> list[str]:

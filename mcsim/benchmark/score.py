@@ -3,14 +3,14 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from mcsim.benchmark import report
 from mcsim.benchmark.bayes import BayesClassifier, facts
 from mcsim.benchmark.case import Drawn, Prior, Record, Truth, pulls
-from mcsim.benchmark.folder import VERDICTS, Settings, all_cases, open_key, read_json
+from mcsim.benchmark.folder import MAPS, QUESTION, VERDICTS, Settings, all_cases, open_key, question, read_json
 from mcsim.benchmark.models import EffectsLibrary, LinearModel, learned_model, linear_model, simulated, workers_of
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.benchmark.summary import ALPHA, Power, Score
@@ -18,7 +18,7 @@ from mcsim.datavector.campaign import Batch, asking
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.context import DiagnosisContext
-from mcsim.diagnosis.selection import Attribution, attribute
+from mcsim.diagnosis.selection import Attribution, Verdict, attribute
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
 from mcsim.sphere import rng
@@ -46,6 +46,8 @@ def score(folder: str | Path, *, workers: Workers | None = None, quiet: bool = T
     if not cases:
         raise InputError(f"{folder} has no verdicts; run mcsim challenge run {folder} first.")
     settings, truths = Settings.read(target), [open_key(target, case) for case in cases]
+    for truth in truths:
+        _check_question(settings, target, truth)
     with workers_of(settings, workers, quiet):
         pass  # now the model is in the cache
     bayes = BayesClassifier(CaseSampler(settings.prior, learned_model(settings)))
@@ -89,14 +91,27 @@ def score_draws(
     return result
 
 
+def _check_question(settings: Settings, folder: Path, truth: Truth) -> None:
+    """Raise InputError unless a case was diagnosed without the effects that its key leaves out."""
+    asked = question(settings, folder, truth.case)
+    if set(asked) != set(truth.without):
+        said, own = (", ".join(names) or "nothing" for names in (asked, truth.without))
+        raise InputError(
+            f"{folder / MAPS / truth.case / QUESTION} leaves out {said}, but the key {own}; restore it, delete "
+            f"{folder / VERDICTS / truth.case} and run mcsim challenge run again."
+        )
+
+
 def _record(settings: Settings, truth: Truth, folder: Path, bayes: BayesClassifier) -> Record:
     """Compare the key of a case with the verdict in a folder."""
     model, full = learned_model(settings, truth.without), bayes.sampler.effects_library
     remedy = f"delete {folder} and run mcsim challenge run again"
     verdict, answer = (read_json(folder / name, remedy) for name in ("verdict.json", "answer.json"))
     try:
-        said, x = _said(truth, verdict, answer, full), np.array(answer["evidence"], dtype=float)
-    except (KeyError, TypeError) as error:
+        if verdict["case"] != truth.case:
+            raise ValueError(f"it is of {verdict['case']}")
+        said, x = _said(truth, verdict, answer, full), _numbers(answer["evidence"], len(model.rows))
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise InputError(f"{folder} holds no verdict ({error}); {remedy}.") from error
     response, members = full.response(truth.members), truth.members
     return Record(
@@ -115,9 +130,9 @@ def _said(
     sets = [verdict["effects"], *verdict["alternatives"]] if verdict["effects"] else []
     reduction = verdict["shrink"] or {}
     return {
-        "p_value": verdict["gap"]["p_value"],
-        "maximum": answer["maximum"],
-        "verdict": verdict["verdict"],
+        "p_value": _probability(verdict["gap"]["p_value"]),
+        "maximum": _probability(answer["maximum"]),
+        "verdict": _word(verdict["verdict"]),
         "answers": tuple(frozenset((effect["name"], effect["channel"]) for effect in one) for one in sets),
         "pulls": _pulls(truth, verdict, answer, library),
         **{key: reduction.get(key) for key in ("predicted", "achieved", "sigma")},
@@ -136,7 +151,32 @@ def _pulls(
     assert member.candidate is not None  # it is of the library
     if not _is_named(verdict["effects"], library.candidates[member.candidate]):
         return ()
-    return pulls(best["amplitudes"], member.coordinates, best["errors"])
+    amplitudes = _numbers(best["amplitudes"], len(member.coordinates))
+    return pulls(amplitudes, member.coordinates, np.asarray(best["errors"], dtype=float))
+
+
+def _numbers(values: Any, count: int) -> Vector:
+    """Return a list as an array; ValueError unless it has so many finite numbers."""
+    found = np.array(values, dtype=float)
+    if found.shape != (count,):
+        raise ValueError(f"{found.size} numbers where {count} are needed")
+    if not np.isfinite(found).all():
+        raise ValueError("numbers that are not finite")
+    return found
+
+
+def _probability(value: Any) -> float:
+    """Return a number from 0 to 1; ValueError for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value <= 1.0:
+        raise ValueError(f"{value!r} is no probability")
+    return value
+
+
+def _word(value: Any) -> str:
+    """Return one of the words for a verdict; ValueError for anything else."""
+    if value not in get_args(Verdict):
+        raise ValueError(f"{value!r} is not one of {', '.join(get_args(Verdict))}")
+    return str(value)
 
 
 def _is_named(effects: Sequence[Mapping[str, Any]], candidate: Candidate) -> bool:

@@ -154,6 +154,71 @@ def test_a_case_without_a_verdict_is_counted(challenge, tmp_path):
     (tmp_path / "case-003").rename(folder / "verdicts" / "case-003")
 
 
+def of_another_case(folder, case):
+    verdict = json.loads((folder / "verdicts" / case / "verdict.json").read_text())
+    return {"verdict.json": verdict | {"case": "case-004"}}
+
+
+def changed(change):
+    def answer(folder, case):
+        found = json.loads((folder / "verdicts" / case / "answer.json").read_text())
+        return {"answer.json": found | change(found)}
+
+    return answer
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        of_another_case,
+        changed(lambda found: {"evidence": found["evidence"][:-3]}),
+        changed(lambda found: {"evidence": [np.nan, *found["evidence"][1:]]}),
+        changed(lambda found: {"evidence": [found["evidence"]]}),
+        changed(lambda found: {"evidence": "none"}),
+        changed(lambda found: {"maximum": np.nan}),
+        changed(lambda found: {"maximum": None}),
+    ],
+)
+def test_a_verdict_that_is_not_that_of_the_case_is_refused(challenge, tmp_path, damage):
+    folder, _ = challenge
+    run(folder, workers=0)
+    for name, content in damage(folder, "case-000").items():
+        path = folder / "verdicts" / "case-000" / name
+        text = path.read_text()
+        path.write_text(json.dumps(content))
+        with refused("case-000"):
+            score.score(folder, workers=0)
+        path.write_text(text)
+
+
+def test_a_verdict_without_other_effects_is_refused(challenge):
+    """A left-out effect that another stands for, of as many elements of the data vector, would not show otherwise."""
+    folder, _ = challenge
+    run(folder, workers=0)
+    path = folder / "cases" / "case-000" / "question.json"
+    text = path.read_text()
+    path.write_text('{"without": ["beam_width", "noise_level"]}')
+    with refused("case-000", "beam_width", "noise_level"):
+        score.score(folder, workers=0)
+    path.write_text(text)
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda path: path.unlink(), lambda path: path.write_bytes(path.read_bytes()[:3000])]
+)
+def test_damaged_maps_are_a_sentence(challenge, tmp_path, damage):
+    folder, _ = challenge
+    run(folder, workers=0)
+    (folder / "verdicts" / "case-000").rename(tmp_path / "verdict")
+    path = folder / "cases" / "case-000" / "W1_half2.fits"
+    content = path.read_bytes()
+    damage(path)
+    with refused(path):
+        run(folder, workers=0)
+    path.write_bytes(content)
+    (tmp_path / "verdict").rename(folder / "verdicts" / "case-000")
+
+
 @pytest.mark.parametrize("lost", ["case-001/SEAL", "case-001"])
 def test_a_lost_case_is_named_and_not_left_out_of_the_score(challenge, tmp_path, lost):
     folder, _ = challenge

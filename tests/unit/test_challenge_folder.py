@@ -22,6 +22,7 @@ from mcsim.benchmark.folder import (
     key_hash,
     key_path,
     open_key,
+    question,
     read_key,
     write_key,
 )
@@ -99,9 +100,13 @@ def test_a_key_that_was_changed_is_found(folder):
     write_key(folder, truth(kind="none", members=()))
     with refused("case-000.json", "SHA-256"):
         open_key(folder, "case-000")
-    seal(folder, "")
+    seal(folder, "ab" * 32)
     with refused("case-000.json", "SHA-256"):
         open_key(folder, "case-000")
+    for damage in (b"\xff\xfe\x00", b"", key_hash(folder, "case-000")[:63].encode()):
+        (folder / MAPS / "case-000" / SEAL).write_bytes(damage)
+        with refused("case-000/SEAL", 64):
+            open_key(folder, "case-000")
     for text in ("{}", "[1]", "no key", '{"schema": 1, "members": [{"name": "beam_width"}], "without": []}'):
         key_path(folder, "case-000").write_text(text)
         with pytest.raises(InputError):
@@ -129,6 +134,20 @@ def test_a_case_that_two_make_at_once_has_the_seal_of_its_key(tmp_path, monkeypa
     monkeypatch.setattr(challenge.secrets, "token_hex", slow)
     make_case(settings, tmp_path, drawn)
     assert open_key(tmp_path, "case-000").nonce == "ab" * 32
+
+
+@pytest.mark.parametrize(
+    "said", ['"beam_width"', '["nonsense"]', "[[1]]", "[1]", "{}", "null", '["effect.py"]', '{"beam_width": 1}']
+)
+def test_a_question_is_a_list_of_known_effects(said, folder):
+    path = folder / MAPS / "case-000" / "question.json"
+    for text in (f'{{"without": {said}}}', said):
+        path.write_text(text)
+        with refused(path):
+            run(folder, workers=0)
+    path.write_text('{"without": ["beam_width", "gain_spin"]}')
+    asked = Settings(config.load("quickstart"), including=("gain_spin",))
+    assert question(asked, folder, "case-000") == ("beam_width", "gain_spin")
 
 
 def test_a_folder_that_is_no_challenge_is_refused(folder, tmp_path):
