@@ -46,7 +46,7 @@ class Settings:
             raise InputError(f"a share of {self.sampled_share:g} made sample by sample is none; give 0 to 1.")
 
     def write(self, folder: Path, seed: int) -> None:
-        """Write the settings, and the seed among the keys; InputError if the folder has others."""
+        """Write the settings, and the seed among the keys; InputError, with what differs, if the folder has others."""
         plain = {
             "schema": 1,
             "model": config.to_dict(self.model),
@@ -59,8 +59,11 @@ class Settings:
         for path, content in ((folder / SETTINGS, plain), (folder / KEYS / SETTINGS, {"seed": seed})):
             text = json.dumps(content, indent=1, sort_keys=True) + "\n"
             write_once(path, text)
-            if path.read_text() != text:
-                raise InputError(f"{path} is of a challenge with other settings; use those again, or another folder.")
+            if changes := _changes(read_json(path, "restore it, or use another folder"), json.loads(text)):
+                raise InputError(
+                    f"{path} is of a challenge with other settings ({'; '.join(changes)}); use those again, or another "
+                    "folder."
+                )
 
     @classmethod
     def read(cls, folder: Path) -> "Settings":
@@ -72,6 +75,17 @@ class Settings:
             return cls(config.load(plain["model"]), prior, share, None, plain["simulations"], including)
         except (KeyError, TypeError) as error:
             raise InputError(f"{folder / SETTINGS} lacks what a challenge needs ({error}); make it again.") from error
+
+
+def _changes(old: Any, new: dict[str, Any]) -> list[str]:
+    """Return what differs in settings: not ``[compute]``, which changes no result; a seed, a secret, without values."""
+    if new.keys() == {"seed"}:
+        return [] if old == new else ["seed"]
+    kept = [dict(one) if isinstance(one, dict) else {} for one in (old, new)]
+    for plain in kept:
+        if isinstance(model := plain.get("model"), dict):
+            plain["model"] = {key: value for key, value in model.items() if key != "compute"}
+    return config.differences(*kept)
 
 
 def read_json(path: Path, remedy: str) -> Any:

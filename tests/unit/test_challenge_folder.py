@@ -88,9 +88,27 @@ def test_settings_are_read_as_they_were_written(folder):
     found = Settings.read(folder)
     assert found == Settings(config.load("quickstart"))
     found.write(folder, 3)
-    for other, seed in ((found, 4), (replace(found, sampled_share=0.1), 3)):
-        with pytest.raises(InputError):
+    other_sky = replace(found.model, sky=replace(found.model.sky, lmax=100))
+    for other, seed, named in (
+        (found, 4, ("keys/challenge.json", "seed")),
+        (replace(found, sampled_share=0.1), 3, (f"{SETTINGS}", "sampled_share: 0.5 -> 0.1")),
+        (replace(found, model=other_sky), 3, (f"model.sky.lmax: {found.model.sky.lmax} -> 100",)),
+        (replace(found, including=("gain_spin",)), 3, ("including", "gain_spin")),
+    ):
+        with refused(*named) as caught:
             other.write(folder, seed)
+        assert str(caught.value).count("->") == (named[-1] != "seed")
+    for damaged in ("5", "{", "[]", '{"model": 3}'):
+        write_whole(folder / SETTINGS, damaged)
+        with refused(SETTINGS):
+            found.write(folder, 3)
+
+
+def test_a_challenge_goes_on_with_other_workers(folder):
+    found = Settings.read(folder)
+    before = (folder / SETTINGS).read_text()
+    replace(found, model=replace(found.model, compute=replace(found.model.compute, workers=7))).write(folder, 3)
+    assert (folder / SETTINGS).read_text() == before
 
 
 def test_a_key_that_was_changed_is_found(folder):
