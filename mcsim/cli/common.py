@@ -34,6 +34,30 @@ def _interrupt_once() -> None:
         signal.signal(name, interrupt)
 
 
+_KEPT = {
+    "run": "realizations",
+    "maps": "maps",
+    "diagnose": "simulations",
+    "challenge make": "simulations and cases",
+    "challenge run": "simulations and verdicts",
+    "challenge score": "simulations of the model",
+    "challenge draws": "simulations of the model",
+}
+"""What commands keep of what they have finished, and go on with."""
+
+
+def _again(ctx: Any) -> str:
+    """Return a clause on what an interrupted command does when it is called again."""
+    names: list[str] = []
+    while ctx.parent is not None:
+        names.insert(0, ctx.info_name)
+        ctx = ctx.parent
+    command = " ".join(names)
+    if command not in _KEPT:
+        return f"call mcsim {command} again"
+    return f"finished {_KEPT[command]} are kept, and mcsim {command} goes on with them when it is called again"
+
+
 class Command(TyperCommand):
     """A command whose flags show no type in --help, and that ends in order when it is interrupted."""
 
@@ -47,8 +71,7 @@ class Command(TyperCommand):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            again = "mcsim run and diagnose go on with it when they are called again"
-            print(f"mcsim: interrupted; what is finished is kept: {again}.", file=sys.stderr)
+            print(f"mcsim: interrupted; {_again(ctx)}.", file=sys.stderr)
             raise Exit(130) from None
 
 

@@ -10,7 +10,7 @@ from mcsim.support import resources
 INTERRUPTED = """
 import signal, sys
 import mcsim.cli
-from mcsim.ensemble import {module}
+from mcsim.{package} import {module}
 
 {module}.{function} = lambda *given, **named: signal.raise_signal(signal.{name})
 sys.argv = ["mcsim", *{command!r}]
@@ -20,20 +20,38 @@ mcsim.cli.main()
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 @pytest.mark.parametrize(
-    ("module", "function", "command"),
+    ("module", "function", "command", "kept"),
     [
-        ("maps", "write_maps", ["maps", "tiny", "-o", "here"]),
-        ("prediction", "predict", ["predict", "tiny"]),
-        ("runner", "run", ["run", "tiny"]),
+        (
+            "ensemble.maps",
+            "write_maps",
+            ["maps", "tiny", "-o", "here"],
+            "finished maps are kept, and mcsim maps goes on",
+        ),
+        ("ensemble.prediction", "predict", ["predict", "tiny"], "call mcsim predict again"),
+        ("ensemble.runner", "run", ["run", "tiny"], "finished realizations are kept, and mcsim run goes on"),
+        (
+            "benchmark.challenge",
+            "make",
+            ["challenge", "make", "tiny", "-o", "here"],
+            "finished simulations and cases are kept, and mcsim challenge make goes on",
+        ),
+        (
+            "benchmark.score",
+            "score_draws",
+            ["challenge", "draws", "tiny", "-o", "here"],
+            "finished simulations of the model are kept, and mcsim challenge draws goes on",
+        ),
     ],
 )
-def test_any_command_ends_in_a_sentence(tmp_path, module, function, command, name) -> None:
+def test_any_command_ends_in_a_sentence(tmp_path, module, function, command, kept, name) -> None:
     """The function that does the work is interrupted as soon as it is called."""
-    program = INTERRUPTED.format(module=module, function=function, command=command, name=name)
+    package, _, module = module.partition(".")
+    program = INTERRUPTED.format(package=package, module=module, function=function, command=command, name=name)
     found = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert found.returncode == 130
     [line] = found.stderr.splitlines()
-    assert line.startswith("mcsim: interrupted; what is finished is kept")
+    assert line.startswith(f"mcsim: interrupted; {kept}")
 
 
 def test_a_warning_of_mcsim_is_a_sentence(tmp_path) -> None:
