@@ -47,8 +47,17 @@ def merge(
 ) -> None:
     """Join slices that were run with --realizations A:B."""
     from mcsim.ensemble import runner
+    from mcsim.ensemble import store as stores
 
-    _report(runner.merge(slices, store, quiet=False))
+    found = runner.merge(slices, store, quiet=False)
+    size = stores.size(found.store)
+    if found.finished == size:
+        _report(found)
+        return
+    print(
+        f"{found.store}: {found.finished} of {size} realizations, {size - found.finished} are missing; merge it with "
+        "the slices that have them, or compute them with mcsim run."
+    )
 
 
 def info(

@@ -19,9 +19,10 @@ import xarray as xr
 import zarr
 from astropy.io import fits
 from astropy.table import Table
+from distributed import Client
 
 from mcsim import cli, config, open_summary
-from mcsim.ensemble import tables
+from mcsim.ensemble import runner, tables
 from mcsim.ensemble.maps import write_map
 from mcsim.ensemble.prediction import predict
 from mcsim.plot.spectra import ensemble_figure
@@ -147,6 +148,16 @@ def test_finished_store_says_so(mcsim: Command, small_store: Path, tmp_path: Pat
     assert code == 0
     assert unnamed(out, small_store, "10 realizations") == []
     assert stamps(small_store) == before
+
+
+def test_a_merge_says_what_is_missing(mcsim: Command, small_store: Path, client: Client, tmp_path: Path) -> None:
+    runner.run(table(), tmp_path / "part.zarr", realizations=slice(0, 7), workers=client)
+    code, out, _ = mcsim("merge", "part.zarr", "-o", "merged.zarr")
+    assert code == 0
+    assert unnamed(out, "merged.zarr", "7 of 10", 3) == []
+    assert "finished" not in out
+    code, out, _ = mcsim("merge", "merged.zarr", small_store, "-o", "whole.zarr")
+    assert (code, out) == (0, "whole.zarr is finished: 10 realizations; its summary is new.\n")
 
 
 @pytest.mark.usefixtures("in_this_process")
