@@ -124,10 +124,12 @@ def picture(asked: Path | None, shown: str | Path, end: str = "") -> Path:
 
 
 def save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]
-    """Save a figure and print its path; raise InputError if the file cannot be written."""
+    """Save a figure and print its path; raise InputError if the file cannot be written, RunError on a full disk."""
     try:
-        figure.savefig(path)
-    except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise InputError(f"{path} cannot be written ({why}); choose another file with -o.") from error
+        with unwritable(path, "choose another file with -o"):
+            figure.savefig(path)
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path} cannot be written ({error}); choose another file with -o.") from error
     print(f"wrote {path}")

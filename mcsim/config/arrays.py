@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.errors import InputError
+from mcsim.errors import InputError, RunError
 from mcsim.support import folders
 from mcsim.support.arrays import numbers
 
@@ -119,7 +119,7 @@ def kept(write: Callable[[Path], Any], what: str) -> Path:
             name = f"given-{hashlib.sha256(contents.encode()).hexdigest()}"
             return folders.cached(name, move, root).absolute()
     except OSError as error:
-        raise InputError(
+        raise (RunError if folders.is_full(error) else InputError)(
             f"cache folder {str(root)!r} cannot take what is given as {what} ({error.strerror}); make room there, or "
             "set MCSIM_CACHE to one that can."
         ) from None

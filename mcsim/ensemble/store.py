@@ -25,7 +25,7 @@ from zarr.storage import MemoryStore
 
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.errors import InputError, RunError
-from mcsim.support.folders import unwritable
+from mcsim.support.folders import is_full, unwritable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -415,7 +415,8 @@ def faults_named(path: Path) -> Iterator[None]:
         raise
     except _FAULTS as error:
         sync(_others_ended())
-        remedy = "repair its disk" if isinstance(error, OSError) else "mcsim info --verify says what is damaged"
+        disk = "make room on its disk" if is_full(error) else "repair its disk"
+        remedy = disk if isinstance(error, OSError) else "mcsim info --verify says what is damaged"
         raise RunError(
             f"The store {path} cannot be used ({type(error).__name__}: {_reason(error)}); {remedy}, and mcsim run "
             "--resume goes on."

@@ -1,5 +1,6 @@
 """Folders that appear complete or not at all, and the cache that all processes share."""
 
+import errno
 import os
 import shutil
 import tempfile
@@ -41,12 +42,19 @@ def appearing(path: Path) -> Iterator[Path]:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
+def is_full(error: BaseException | None) -> bool:
+    """Return True for an error of a disk, or a quota, that is full: the input is not to blame."""
+    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
 @contextmanager
 def unwritable(name: str | Path, remedy: str) -> Iterator[None]:
-    """Turn the file system's refusal to write into an InputError."""
+    """Turn the file system's refusal to write into an InputError, and a full disk into a RunError."""
     try:
         yield
     except OSError as error:
+        if is_full(error):
+            raise RunError(f"{name} cannot be written ({error.strerror}); make room there and try again.") from error
         raise InputError(f"{name} cannot be written ({error.strerror or error}); {remedy}.") from error
 
 
@@ -131,7 +139,7 @@ def cached(name: str, fill: Callable[[Path], None], cache_dir: str | Path | None
         except OSError as error:
             if error.errno is None:  # from a connection or a timeout, not from a file
                 raise
-            raise InputError(
+            raise (RunError if is_full(error) else InputError)(
                 f"cache folder {str(root)!r} cannot be written ({error.strerror}); make room there, or set MCSIM_CACHE "
                 "to one that can."
             ) from None

@@ -68,10 +68,21 @@ def test_full_disk(small_store: Path, client: Client, disk: Path) -> None:
     assert_same(path, small_store)
 
 
+def test_merge_on_a_full_disk_names_the_store_to_make(small_store: Path, disk: Path) -> None:
+    assert remount(disk, "size=64k")
+    with refused(disk / "merged.zarr", by=RunError, errno=errno.ENOSPC) as caught:
+        runner.merge([small_store], disk / "merged.zarr")
+    assert "--resume" not in str(caught.value)
+    assert not list(disk.iterdir())
+    assert remount(disk, "size=64m")
+    runner.merge([small_store], disk / "merged.zarr")
+    assert_same(disk / "merged.zarr", small_store)
+
+
 def test_disk_without_room_is_refused(client: Client, disk: Path) -> None:
     (disk / "ballast").write_bytes(bytes(1 << 20))
     assert remount(disk, "size=1m")
-    with refused("x.zarr", "-o", errno=errno.ENOSPC) as kept:  # as a notebook keeps the last exception
+    with refused("x.zarr", by=RunError, errno=errno.ENOSPC) as kept:  # as a notebook keeps the last exception
         runner.run(table(), disk / "x.zarr", workers=client)
     assert kept.value.__cause__ is not None
     assert sorted(p.name for p in disk.iterdir()) == ["ballast"]

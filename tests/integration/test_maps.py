@@ -18,6 +18,7 @@ from mcsim.datavector.wiener_filter import model_of
 from mcsim.ensemble import maps as maps_
 from mcsim.ensemble import runner
 from mcsim.ensemble.maps import write_map, write_maps
+from mcsim.errors import RunError
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
 from refusals import refused
@@ -138,10 +139,10 @@ def test_nothing_is_written_over_and_nothing_is_left_half(tmp_path: Path, monkey
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(healpy, "write_map", full)
-    with refused("-o", errno=errno.ENOSPC):
+    with refused(folder / "00002", by=RunError, errno=errno.ENOSPC):
         write_maps(run, folder, slice(2, 3))
     assert [file.name for file in folder.iterdir()] == ["00001"]
-    with refused("-o", errno=errno.ENOSPC):
+    with refused(tmp_path / "y", by=RunError, errno=errno.ENOSPC):
         write_maps(run, tmp_path / "y", 0)
     assert not (tmp_path / "y").exists()
 

@@ -1,5 +1,6 @@
 """What goes wrong around a run: two writers, changed files, cuts at awkward moments, stores that do not fit."""
 
+import errno
 import os
 import shutil
 import socket
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import zarr
 from distributed import Client
+from zarr.storage import _local
 
 from mcsim import Moments, config, open_ensemble, open_summary
 from mcsim.ensemble import plan, runner, store
@@ -115,6 +117,21 @@ def test_merge_of_a_short_and_a_long_ensemble_is_the_long_one(
     assert "merge: 4/4 realizations" in capsys.readouterr().err
     attributes = store.attributes(tmp_path / "merged.zarr")
     assert attributes["configuration"] == store.attributes(small_store)["configuration"]
+
+
+def test_merge_on_a_full_disk_names_the_store_to_make(
+    small_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    for module, name in ((_local, "_put"), (store, "_write_files")):
+        with monkeypatch.context() as patch, refused("merged.zarr", by=RunError, errno=errno.ENOSPC) as caught:
+            patch.setattr(module, name, full)
+            runner.merge([small_store], tmp_path / "merged.zarr")
+        assert "--resume" not in str(caught.value)
+        assert str(tmp_path / "merged.zarr") in str(caught.value)
+        assert not list(tmp_path.iterdir())
 
 
 def test_damaged_chunk_is_named_and_nothing_is_merged(small_store: Path, tmp_path: Path) -> None:

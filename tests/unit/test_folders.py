@@ -1,10 +1,12 @@
 """Folders that appear complete or not at all."""
 
 import errno
+import os
 
 import pytest
 
-from mcsim.support.folders import appearing, cached, default_cache_dir, user_path
+from mcsim.errors import InputError, RunError
+from mcsim.support.folders import appearing, cached, default_cache_dir, unwritable, user_path
 from refusals import refused
 
 
@@ -43,12 +45,18 @@ def test_a_file_in_the_way_is_an_error(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
 
 
-def test_a_cache_that_is_full_is_said_to_be(tmp_path):
-    def full(folder):
-        raise OSError(errno.ENOSPC, "No space left on device")
+@pytest.mark.parametrize(
+    ("number", "kind"), [(errno.ENOSPC, RunError), (errno.EDQUOT, RunError), (errno.EROFS, InputError)]
+)
+def test_a_full_disk_is_no_bad_input(tmp_path, number, kind):
+    def fail(folder=None):
+        raise OSError(number, os.strerror(number))
 
-    with refused("MCSIM_CACHE"):
-        cached("name", full, tmp_path)
+    with refused("MCSIM_CACHE", by=kind, errno=number):
+        cached("name", fail, tmp_path)
+    with refused(tmp_path, by=kind, errno=number) as caught, unwritable(tmp_path, "choose another"):
+        fail()
+    assert ("choose another" in str(caught.value)) == (kind is InputError)
 
 
 def test_a_lost_connection_is_not_blamed_on_the_cache(tmp_path):

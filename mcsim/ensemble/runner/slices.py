@@ -2,7 +2,8 @@
 
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,8 @@ from numpy.typing import NDArray
 from mcsim.ensemble import opening, plan, store, summary
 from mcsim.ensemble.runner.batch import Result
 from mcsim.ensemble.tasks import empty, summarise_node
-from mcsim.errors import InputError
-from mcsim.support.folders import user_path
+from mcsim.errors import InputError, RunError
+from mcsim.support.folders import is_full, user_path
 from mcsim.support.progress import reporting
 
 
@@ -37,6 +38,8 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     ------
     InputError
         If the stores are not of one configuration, or ``path`` exists.
+    RunError
+        If the disk is full; nothing of the new store is left.
 
     Examples
     --------
@@ -59,7 +62,8 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     size = max(store.size(source) for source in sources)
     layout = opening.layout(sources[0], size)
     first["configuration"]["ensemble"]["realizations"] = size
-    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=store.check_writable(target)) as folder:
+    place = store.check_writable(target)
+    with _disk_named(target), tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=place) as folder:
         scratch = Path(folder) / "merged"
         store.create(scratch, layout, first)
         there = np.zeros(size, dtype=bool)
@@ -77,6 +81,18 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(scratch, target)
     return Result(target, int(store.done(target).sum()), 0, (), summarised=total is not None)
+
+
+@contextmanager
+def _disk_named(target: Path) -> Iterator[None]:
+    """Name the store to make, not the scratch folder, where its disk is full; there is nothing to resume."""
+    try:
+        yield
+    except (OSError, RunError) as error:
+        full = error if is_full(error) else error.__cause__
+        if not isinstance(full, OSError) or not is_full(full):
+            raise
+        raise RunError(f"{target} cannot be written ({full.strerror}); make room there and merge again.") from error
 
 
 def _merge_chunk(sources: list[Path], target: Path, start: int, stop: int) -> None:
