@@ -1,6 +1,7 @@
 """The documented walk through a stored ensemble, executed, and held against the summary that the run made."""
 
 import importlib.util
+import re
 import sys
 from pathlib import Path
 
@@ -52,3 +53,20 @@ def test_modes_are_chosen_by_numbers(small_store: Path) -> None:
     ensemble = walk.finished(small_store)
     assert list(walk.choose(ensemble, L=2, M=0)["mode"].values) == ["L2M0d0", "L2M0d1", "L2M0d2"]
     assert walk.choose(ensemble, d=2).sizes["mode"] == 3
+
+
+@pytest.mark.parametrize(("mode", "turn"), [("L2M0d0", 1.0), ("L2M0d1", 1j), ("L2M1d1", 1j), ("L2M2d0", 1.0)])
+def test_the_recipe_of_the_tutorial_finds_a_signal_in_either_part(small_store: Path, mode: str, turn: complex) -> None:
+    """Modes with M = 0 are imaginary if their parity is odd; the page took their real part."""
+    page = (Path(__file__).parents[2] / "docs" / "tutorials" / "stored-ensemble.md").read_text()
+    [cell] = [cell for cell in re.findall(r"```{code-cell}\n(.*?)```", page, re.DOTALL) if "largest bin" in cell]
+    summary = open_summary(small_store).load().assign_coords(pair=["V,V"])
+    error = summary.biposh_difference_binned_standard_error
+    signal = turn * error.where(summary.mode == mode, 0.0) * xr.where(summary.M > 0, np.sqrt(0.5), 1.0)
+    summary["biposh_difference_binned_mean"] = 123.0 * signal
+    names = {"summary": summary, "xr": xr, "np": np}
+
+    exec(cell, names)
+    found = names["z"]
+    assert float(found.sel(mode=mode)) == pytest.approx(123.0)
+    assert float(found.sum()) == pytest.approx(123.0)
