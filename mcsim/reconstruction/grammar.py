@@ -142,6 +142,11 @@ class Structure:
         return self.frame == "sky" and bool(self.acts_on) and self.size <= FREE
 
     @property
+    def of_variances(self) -> bool:
+        """Return True for noise and powers, whose scores are variances themselves."""
+        return self.stage == "noise" or self.kind == "power"
+
+    @property
     def leaves_low(self) -> bool:
         """Return True if the scores leave out monopoles and dipoles that the structure makes."""
         return self.stage == "modulation" or (self.stage, self.acts_on) == ("gain", "sky")

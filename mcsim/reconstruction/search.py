@@ -243,15 +243,16 @@ class Search:
     def _fit_on_sky(self, member: int, scores: Vector, coordinates: Matrix, made: Matrix) -> tuple[float, Vector]:
         """Return fall of chi^2 and amplitudes of a structure, of whose coordinates it is known what they make.
 
-        What a structure that acts on the sky makes of its own scores on this sky is their variance there, which that of
-        all skies is not where few modes are bright.
+        What it makes of its own scores on this sky is their variance there, which that of all skies is not where few
+        modes are bright.
         """
         structure, null = self.grammar[member], self.nulls[member]
         x, t = structure.of(scores), structure.of(made)
-        if null is not None and not (structure.acts_on and self.exact):
+        if null is not None and (structure.of_variances or not self.exact):
             fit = null.fit(x, t.T)
             return null.hartlap_factor * fit.delta_chi2 * self._share(member, scores), fit.amplitudes
-        known, information = coordinates @ (x - structure.of(self.simulations).mean(axis=0)), coordinates @ t.T
+        rows = structure.of(self.simulations)
+        known, information = coordinates @ (x - rows.mean(axis=0)), coordinates @ t.T
         if structure.leaves_low and self._low_null is not None:
             white = np.sqrt(self._low_null.hartlap_factor) * self._low_null.whiten_templates(made[:, self._low].T)
             known = known + white.T @ self._low_null.whiten(scores[self._low])
@@ -260,7 +261,11 @@ class Search:
         sizes, axes = np.linalg.eigh(0.5 * scale[:, None] * (information + information.T) * scale)
         kept = sizes > LEAST * sizes[-1]
         along = axes[:, kept].T @ (scale * known)
-        return float(np.sum(along**2 / sizes[kept])), scale * (axes[:, kept] @ (along / sizes[kept]))
+        fall, amplitudes = float(np.sum(along**2 / sizes[kept])), scale * (axes[:, kept] @ (along / sizes[kept]))
+        if not structure.acts_on:  # the same on every sky: more scatter than that is none of the filter's model
+            scatter = float(np.var(rows @ (amplitudes @ coordinates), ddof=1))
+            fall *= min(1.0, fall / scatter * (1.0 + 4.0 * np.sqrt(2.0 / len(rows))))
+        return fall, amplitudes
 
     @cached_property
     def _low(self) -> NDArray[np.int64]:
@@ -296,7 +301,7 @@ class Search:
         which their score says a^2/2: a bright pattern, which raises the variance too, would be noise first.
         """
         structure = self.grammar[member]
-        if structure.stage != "noise" and structure.kind != "power":
+        if not structure.of_variances:
             return 1.0
         if structure.kind in ("power", "spectrum"):
             rows, x = structure.of(self.simulations), structure.of(scores)

@@ -87,19 +87,21 @@ def test_what_is_there_is_found_with_its_size():
     assert np.allclose(search.amplitudes([chosen[2]], x, response[None]), [2.0])
 
 
-def test_what_acts_on_the_sky_is_judged_by_what_it_makes_on_this_sky():
-    """The response is the information on this sky, and twice that of others where its modes are twice as bright."""
+def test_structures_are_judged_by_what_they_make_on_this_sky():
+    """The response is the information; one below the scatter counts where other skies may be brighter."""
     chosen, simulations, mix = toy(400)
     place = np.array([[0]])
     gain = Structure("gain", "sky and dipole", "", "constant", "W1", ALIKE, None, place, np.ones(1), None, (0,))
     search = Search((chosen[0], gain), simulations)
     x = 5.0 * (mix @ mix.T)[0] + simulations.mean(axis=0)
-    responses = [(one, 2.0 * made) for one, made in (search.response(k, x) for k in (0, 1))]
-    _, (added, multiplied), amplitudes = search.judged([0, 1], x, responses)
-    np.testing.assert_allclose(np.concatenate(amplitudes), 0.5, rtol=0.02)
-    assert multiplied == pytest.approx(0.5 * added, rel=0.02)
-    _, falls, _ = replace(search, exact=False).judged([0, 1], x, responses)
-    assert falls[1] == pytest.approx(added, rel=1e-6)
+    (expected,) = search._falls(x)[:1]
+    for factor, falls in ((2.0, (0.5, 0.5)), (0.5, (1.0 + 4.0 * np.sqrt(2.0 / 400), 2.0))):
+        responses = [(one, factor * made) for one, made in (search.response(k, x) for k in (0, 1))]
+        _, found, amplitudes = search.judged([0, 1], x, responses)
+        np.testing.assert_allclose(np.concatenate(amplitudes), 1.0 / factor, rtol=0.02)
+        np.testing.assert_allclose(found, expected * np.array(falls), rtol=0.02)
+        _, average, _ = replace(search, exact=False).judged([0, 1], x, responses)
+        np.testing.assert_allclose(average, expected, rtol=0.02)
 
 
 def test_monopoles_and_dipoles_that_a_modulation_makes_count():
