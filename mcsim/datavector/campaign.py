@@ -17,6 +17,7 @@ from mcsim.datavector.bipolar_scan import rms
 from mcsim.datavector.candidate import Candidate, TemplateBank
 from mcsim.datavector.kept import Kept
 from mcsim.datavector.null_ensemble import NullEnsemble, without_nuisances
+from mcsim.datavector.repeats import check_distinct
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.ensemble import runner
 from mcsim.ensemble.external_maps import Source
@@ -187,6 +188,8 @@ def learned(
         return np.concatenate(rows) if rows else np.zeros((0, whole))
 
     null, references = stacked("null"), {False: stacked("reference"), True: stacked("external reference")}
+    if analysis.source is not None:
+        check_distinct(null[:, :size], analysis.source, _COVARIANCE)
     labels = tuple(label for candidate in analysis.candidates for label in candidate.labels)
     matrix, curvature, error = np.zeros((3, whole, len(labels)))
     for candidate, column, sign, effect in _steps(analysis):
@@ -264,6 +267,8 @@ def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool
     # What is needed in any case keeps workers busy to the end of the pilot; external simulations wait for its verdict.
     first = run([one for one in jobs if (one.number < few if one.kind == "null" else source is None)])
     drawn = np.concatenate([result[:, :size] for purpose, result in first.items() if purpose.kind == "null"])
+    if source is not None:
+        check_distinct(drawn, source, _COVARIANCE)
     quiet = without_nuisances(drawn, _nuisances(analysis, len(drawn)))
     independent = SimulatedGaussian.from_simulations(quiet, floor=settings.redundant).dimension
     enough = _needed(settings, independent)

@@ -6,12 +6,10 @@ import numpy as np
 
 from mcsim.datavector.analysis import Job, external_maps
 from mcsim.datavector.campaign import Task
+from mcsim.datavector.repeats import REPEATS
 from mcsim.ensemble.external import SEEDS
 from mcsim.errors import InputError
 from mcsim.support.arrays import Map, Matrix
-
-REPEATS = 1e-6
-"""Rms difference over the rms up to which two maps of one seed are the same: threads add numbers in any order."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Simulators of others, on runs of ours: the same maps as ours, and what their own arguments change is named."""
+"""Simulators of others: the same maps as ours on runs of ours, what their arguments change, and what they do wrong."""
 
 import importlib
 from pathlib import Path
@@ -13,6 +13,9 @@ from mcsim.datavector.campaign import with_effects
 from mcsim.ensemble.external import source_of
 from mcsim.simulation import sampled
 from mcsim.simulation.survey import survey
+from refusals import refused
+
+from .test_external import FEW, MODEL, SETTINGS, Plain, arrays_of, diagnosed, native
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # theirs
 FOLDER = Path(__file__).parents[2] / "workflows" / "simulators"
@@ -80,3 +83,22 @@ def test_litebird_sim_as_a_model_adds_an_effect_to_the_sky_that_it_is_given(monk
         expected = ours[1][name] - ours[0][name]
         assert np.std((before - ours[0][name])[seen]) < 1e-4 * np.std(before[seen])
         assert np.std((after - before - expected)[seen]) < 0.02 * np.std(expected[seen])
+
+
+def test_realizations_that_repeat_others_are_refused():
+    """Each would count as one of its own: the covariance would be too small, or singular."""
+    stack = native(1, 70)
+    for repeated, words in (
+        (np.concatenate([stack, stack[3:33]]), ("realization 3", "realization 70", 100, 70)),
+        (np.repeat(stack[:1], 100, axis=0), ("realization 0", "realization 1", 100, 1)),
+    ):
+        with refused(*words):
+            mcsim.diagnose(mcsim.ExternalModel(MODEL, repeated), list(stack[0]), settings=SETTINGS)
+        with refused(*words[:2]):
+            mcsim.diagnose(mcsim.ExternalModel(MODEL, repeated), list(stack[0]), settings=FEW)
+
+    def few(seed):
+        return dict(zip(("V:a", "V:b"), arrays_of(Plain().simulate(seed % 30)), strict=True))
+
+    with refused("few", "seed", 130, 30):
+        diagnosed(few)
