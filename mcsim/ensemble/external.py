@@ -1,6 +1,5 @@
 """Simulators of other programs: a function, a class or stored maps in place of a run."""
 
-import hashlib
 import inspect
 import os
 import sys
@@ -21,7 +20,7 @@ from mcsim.config import arrays
 from mcsim.ensemble.external_maps import Part, Source, StoredMaps, fits_maps, hash_of, parts_of, stacked
 from mcsim.errors import InputError, RunError
 from mcsim.support.arrays import Alm
-from mcsim.support.code import class_digest
+from mcsim.support.code import class_digest, value_digest
 
 SEEDS = 1 << 20  #: realizations of a stream of seeds
 
@@ -33,20 +32,16 @@ _GOLDEN = 2654435769  #: 2^32 over the golden ratio, odd: multiples modulo 2^32 
 
 @dataclass(frozen=True)
 class Code(Source):
-    """A function or class; ``made`` is the pickle of a function that returns it, ``held`` a hash of what it holds."""
+    """A function or class; ``made`` is the pickle of a function that returns it, ``content`` a hash of its code."""
 
     made: bytes = b""
-    held: str = ""
+    content: str = ""  # and of ``state``, or without one of everything that it holds
 
     def words(self, seed: int, realization: int) -> str:
         return f"{self.label} with seed {seed_of(seed, realization)}"
 
     def identity(self) -> str:
-        """Return a hash of the source code and of ``state``, or without one of everything that the object holds."""
-        simulator = _loaded(self.made)
-        state = getattr(simulator, "state", None)
-        held = self.held if state is None else repr(state)
-        return hash_of(class_digest(_definition(simulator)), held, self.effects, self.takes_sky)
+        return hash_of(self.content, self.effects, self.takes_sky)
 
     def _given(self, seed: int, realization: int, effects: Sequence[config.Effect], sky: Alm | None) -> Any:
         own: dict[str, Any] = {"effects": tuple(effects)} if effects else {}
@@ -93,19 +88,18 @@ def source_of(run: config.RunConfig, given: Any) -> Source:
             return StoredMaps(parts, Path(text).name, path=os.path.abspath(text))
         made = cloudpickle.dumps(partial(_resolved, text, config.to_json(run), _written(text.rpartition(":")[0])))
         # The run is a part of what tells diagnoses apart already.
-        return _code(parts, os.path.basename(text), made, os.path.basename(text))
+        return _code(parts, os.path.basename(text), made, None)
     label = getattr(given, "__name__", type(_whole(given)).__name__)
     if isinstance(given, type):
-        return _code(parts, label, cloudpickle.dumps(partial(_instance, given, config.to_json(run))), label)
+        return _code(parts, label, cloudpickle.dumps(partial(_instance, given, config.to_json(run))), given)
     try:
         made = cloudpickle.dumps(partial(_same, given))
     except Exception as error:  # of any type, from what the object holds
         raise InputError(f"the simulator {given!r} cannot be sent to workers ({error}); hold no open files.") from error
-    held = hashlib.sha256(made).hexdigest()
     if len(made) > LARGEST:
         kept = arrays.kept(lambda folder: (folder / "simulator").write_bytes(made), "simulator") / "simulator"
         made = cloudpickle.dumps(partial(_read, str(kept)))
-    return _code(parts, label, made, held)
+    return _code(parts, label, made, given)
 
 
 def seed_of(seed: int, realization: int) -> int:
@@ -118,8 +112,12 @@ def seed_of(seed: int, realization: int) -> int:
     return (seed * SEEDS + realization) * _GOLDEN % (1 << 32)
 
 
-def _code(parts: tuple[Part, ...], label: str, made: bytes, held: str) -> Code:
-    """Return the source of a simulator, from what it says of itself."""
+def _code(parts: tuple[Part, ...], label: str, made: bytes, given: Any) -> Code:
+    """Return the source of a simulator, from what it says of itself.
+
+    ``given`` is told from others by its source, and not the copy that ``made`` returns, which has none in a script;
+    None: that copy is from a module.
+    """
     simulator = _loaded(made)
     method, effects = _method(simulator), getattr(simulator, "effects", ())
     if isinstance(effects, str) or not all(isinstance(name, str) for name in effects):
@@ -128,7 +126,20 @@ def _code(parts: tuple[Part, ...], label: str, made: bytes, held: str) -> Code:
     if not takes or (effects and "effects" not in takes):
         missing = "effects" if takes else "seed"
         raise InputError(f"simulate of {label} has no argument {missing}; define simulate(seed, effects=()).")
-    return Code(parts, label, tuple(effects), "sky" in takes, made, held)
+    return Code(parts, label, tuple(effects), "sky" in takes, made, _content(simulator, given))
+
+
+def _content(simulator: Any, given: Any) -> str:
+    """Return a hash of the source code and of ``state``, or without one of everything that the object holds.
+
+    What a class or module makes with the description holds no more than these: a part of what tells diagnoses apart.
+    """
+    state = getattr(simulator, "state", None)
+    if state is not None:
+        return hash_of(class_digest(_definition(simulator if given is None else given)), repr(state))
+    if given is None and not isinstance(simulator, partial):
+        return class_digest(_definition(simulator))
+    return value_digest(simulator if given is None else given)
 
 
 def _same(given: Any) -> Any:

@@ -1,18 +1,26 @@
 """Identify code by its content, so that nothing in a cache is older than the code that made it."""
 
 import ast
+import copyreg
 import dataclasses
 import hashlib
 import inspect
 import pickle
 import sys
+import textwrap
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module, metadata
+from importlib.util import find_spec
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
+
+import cloudpickle
+import numpy as np
 
 
 @cache
@@ -40,19 +48,37 @@ def class_digest(kind: type | FunctionType) -> str:
 
     Of a module in no package, what it imports from its own folder counts as well; of a script or notebook the source,
     and what it uses of the rest. Files are read when code is first seen, as it is loaded then; values that functions
-    hold count as they are. Those of mcsim do not count. Code whose source cannot be read, typed at a prompt for
-    instance, gets a new digest at every call.
+    hold count as they are. Those of mcsim and of installed libraries do not count. Code whose source cannot be read,
+    typed at a prompt for instance, gets a new digest at every call.
     """
+    return _hash(_of_code(kind, []))
+
+
+def value_digest(value: Any) -> str:
+    """Return the SHA-256 of what a value holds and of the code that defines it, the same in every process.
+
+    Code counts as in :func:`class_digest`.
+    """
+    return _hash(_of_value(value, []))
+
+
+def _hash(found: Iterable[str]) -> str:
+    return hashlib.sha256("\n".join(found).encode()).hexdigest()
+
+
+def _of_code(kind: type | FunctionType, met: list[Any]) -> list[str]:
+    """Return what tells code from other code; what has been ``met`` counts by its name."""
     found = [f"{kind.__module__}.{kind.__qualname__}"]
     for base in kind.__mro__ if isinstance(kind, type) else (kind,):
         top = base.__module__.partition(".")[0]
-        if top == "mcsim" or (top in sys.stdlib_module_names and top != "__main__"):
+        if any(base is one for one in met) or top == "mcsim" or (top in sys.stdlib_module_names and top != "__main__"):
             continue
+        met.append(base)
         try:
-            found += _of_script(base, []) if top == "__main__" else [_of_file(base), *_held(base, [])]
+            found += _of_script(base, met) if top == "__main__" else [_of_file(base), *_held(base, met)]
         except (AttributeError, ImportError, OSError, pickle.PicklingError, SyntaxError, TypeError):
             found.append(uuid.uuid4().hex)
-    return hashlib.sha256("\n".join(found).encode()).hexdigest()
+    return found
 
 
 @cache
@@ -62,8 +88,11 @@ def _of_file(kind: type | FunctionType) -> str:
 
 def _of_script(kind: type | FunctionType, met: list[Any]) -> list[str]:
     """Return the source of what a script or notebook defines, and of what it uses that is defined there, too."""
-    met.append(kind)
-    return [inspect.getsource(kind), *_held(kind, met)]
+    source, imported = inspect.getsource(kind), set[str]()
+    with suppress(SyntaxError):  # of a function without a name within a statement
+        imported = _imported(ast.parse(textwrap.dedent(source)))
+    modules = [import_module(name) for name in sorted(imported) if name in sys.modules or find_spec(name) is not None]
+    return [source, *(text for one in modules for text in _of_value(one, met)), *_held(kind, met)]
 
 
 def _held(kind: type | FunctionType, met: list[Any]) -> list[str]:
@@ -73,6 +102,8 @@ def _held(kind: type | FunctionType, met: list[Any]) -> list[str]:
     functions = [one for one in ([kind] if isinstance(kind, FunctionType) else own) if isinstance(one, FunctionType)]
     found = []
     for function in functions:
+        for own_part in (function.__defaults__, function.__kwdefaults__, vars(function)):
+            found += _of_value(own_part, met)
         if function.__code__.co_filename not in ("<string>", dataclasses.__file__):  # made from its fields
             used = inspect.getclosurevars(function)
             there = used.globals if function.__module__ == "__main__" else {}
@@ -82,11 +113,66 @@ def _held(kind: type | FunctionType, met: list[Any]) -> list[str]:
 
 
 def _of_value(value: Any, met: list[Any]) -> list[str]:
+    """Return what tells a value from others, in an order that is the same in every process."""
+    name = f"{type(value).__module__}.{type(value).__qualname__}"
+    if value is None or isinstance(value, bool | int | float | complex | str | bytes):
+        return [name, repr(value)]
     if isinstance(value, type | FunctionType):
-        if value.__module__ != "__main__" or value in met:
-            return [f"{value.__module__}.{value.__qualname__}"]
-        return _of_script(value, met)
-    return [value.__name__] if isinstance(value, ModuleType) else [hashlib.sha256(pickle.dumps(value)).hexdigest()]
+        known = value.__module__ == "__main__" or _is_of_user(value.__module__)
+        return _of_code(value, met) if known else [f"{value.__module__}.{value.__qualname__}"]
+    if isinstance(value, ModuleType):
+        found = _is_of_user(value.__name__)
+        return [value.__name__, _of_module(_One(value.__spec__), value.__name__)] if found else [value.__name__]
+    if isinstance(value, np.ndarray) and not value.dtype.hasobject:
+        return [f"{name} {value.dtype} {value.shape}", hashlib.sha256(value.tobytes()).hexdigest()]
+    if any(value is one for one in met):
+        return [name]
+    met.append(value)
+    if isinstance(value, set | frozenset):
+        return [name, *sorted(_hash(_of_value(one, [*met])) for one in value)]
+    if isinstance(value, dict):
+        parts = [part for item in value.items() for part in item]
+    elif isinstance(value, list | tuple):
+        parts = list(value)
+    else:
+        parts = [list(part) if isinstance(part, Iterator) else part for part in _reduced(value)]
+    return [f"{name} of {len(parts)}", *(text for part in parts for text in _of_value(part, met))]
+
+
+def _reduced(value: Any) -> Iterable[Any]:
+    """Return what an object is made from when it is sent to a worker."""
+    try:
+        found = copyreg.dispatch_table.get(type(value), lambda one: one.__reduce_ex__(4))(value)
+    except TypeError:  # what cloudpickle alone can send
+        found = cloudpickle.dumps(value)
+    return found if isinstance(found, tuple) else (found,)
+
+
+@dataclass(frozen=True, eq=False)
+class _One:
+    """An object that is equal to itself alone: that of a module that is loaded again is another one."""
+
+    value: Any
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _One) and other.value is self.value
+
+    def __hash__(self) -> int:
+        return id(self.value)
+
+
+@cache
+def _of_module(spec: _One, name: str) -> str:
+    return _digest(_with_imports(_files(name.partition(".")[0])))
+
+
+def _is_of_user(name: str) -> bool:
+    """Return True for a module that is neither mcsim's, nor Python's, nor that of an installed library."""
+    top = name.partition(".")[0]
+    if top in ("mcsim", "__main__") or top in sys.stdlib_module_names or top not in sys.modules:
+        return False
+    folders = [*getattr(sys.modules[top], "__path__", ()), getattr(sys.modules[top], "__file__", None) or ""]
+    return any(folders) and not any({"site-packages", "dist-packages"} & set(Path(one).parts) for one in folders)
 
 
 def _digest(files: Iterable[Path], *more: str) -> str:
@@ -107,14 +193,21 @@ def _with_imports(files: list[Path]) -> list[Path]:
         if path in found:
             continue
         found.add(path)
-        for node in ast.walk(ast.parse(path.read_bytes())):
-            names = [one.name for one in node.names] if isinstance(node, ast.Import) else []
-            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                names = [node.module]
-            for top in {name.partition(".")[0] for name in names}:
-                waiting += [one for one in (folder / f"{top}.py",) if one.is_file()]
-                waiting += (folder / top).rglob("*.py")
+        for top in _imported(ast.parse(path.read_bytes())):
+            waiting += [one for one in (folder / f"{top}.py",) if one.is_file()]
+            waiting += (folder / top).rglob("*.py")
     return sorted(found)
+
+
+def _imported(tree: ast.AST) -> set[str]:
+    """Return the packages and modules that code imports by their whole names."""
+    names = set[str]()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {one.name for one in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names.add(node.module)
+    return {name.partition(".")[0] for name in names}
 
 
 def _files(name: str) -> list[Path]:

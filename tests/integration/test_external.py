@@ -289,7 +289,7 @@ def test_a_large_simulator_is_a_file_of_the_cache():
     sources = [source_of(run, partial(Plain.simulate, Plain(), sky=one)) for one in (*held, held[0])]
     assert all(len(source.made) < 1000 for source in sources)
     assert sources[0].identity() != sources[1].identity()
-    assert sources[0].held == sources[2].held
+    assert sources[0].content == sources[2].content
 
 
 class Told:
@@ -306,7 +306,7 @@ def test_a_class_is_made_with_the_description():
     source = source_of(config.load(MODEL), Told)
     assert [maps[0] for maps in source.maps(0, 0)] == [SIGMA, SIGMA]
     busier = replace(config.load(MODEL), compute=config.Compute(workers=5))
-    assert source_of(busier, Told).held == source.held
+    assert source_of(busier, Told).content == source.content
 
 
 def test_seeds_are_unique_and_far_apart():

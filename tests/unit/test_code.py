@@ -124,3 +124,56 @@ def test_a_class_without_source_is_never_the_same():
     space = {"__name__": "no_such_module"}
     exec("class Typed: pass", space)
     assert class_digest(space["Typed"]) != class_digest(space["Typed"])
+
+
+SIMULATORS = """
+import sys
+from functools import partial
+
+import mcsim
+from mcsim import config
+from mcsim.ensemble.external import source_of
+from helper_of_a_user import SIZE, noise
+
+LEVEL = 1.0
+
+class Mine:
+    def __init__(self):
+        self.names, self.level = {"a", "bb", "ccc", "dddd"}, LEVEL
+
+    def simulate(self, seed):
+        return {"demo": self.level * noise(seed)}
+
+def plain(seed):
+    from helper_of_a_user import noise as drawn
+    return {"demo": LEVEL * drawn(seed)}
+
+def closure(level):
+    def simulate(seed, size=SIZE):
+        return {"demo": level * noise(seed)}
+    return simulate
+
+given = (Mine(), Mine, plain, closure(LEVEL), lambda seed: plain(seed), partial(plain))
+print(*(source_of(config.load("tiny"), one).identity() for one in given))
+"""
+HELPER = "import numpy as np\nSIZE = 3072\ndef noise(seed):\n    return np.random.default_rng(seed).normal(size=SIZE)\n"
+
+
+def test_simulators_of_a_script_are_known_by_their_code_and_what_they_hold(tmp_path):
+    """In every process alike, so that the same script finds what it has simulated; other code is other simulations."""
+
+    def identities(script=SIMULATORS, helper=HELPER):
+        (tmp_path / "helper_of_a_user.py").write_text(helper)
+        (tmp_path / "script.py").write_text(script)
+        command = [sys.executable, "-B", str(tmp_path / "script.py")]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+
+    first = identities()
+    assert len(set(first)) == 6
+    assert identities() == first
+    assert identities(SIMULATORS + "OTHER = 1\n") == first
+    for changed in (
+        identities(SIMULATORS.replace("LEVEL = 1.0", "LEVEL = 2.0")),
+        identities(helper=HELPER.replace("normal(size", "normal(scale=2.0, size")),
+    ):
+        assert not set(changed) & set(first)
