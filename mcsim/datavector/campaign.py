@@ -141,6 +141,11 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
     return {purpose: replace(job, slices=analysis.of_maps) for purpose, job in jobs.items()}
 
 
+def is_of_the_model(job: Job) -> bool:
+    """Return True for simulations of the model for its covariance."""
+    return config.from_json(job.simulated).ensemble.seed == _COVARIANCE
+
+
 def _split(job: Job, realizations: range, size: int = PER_TASK) -> list[Job]:
     """Return jobs of at most ``size`` of these realizations each."""
     stop = realizations.stop

@@ -102,3 +102,45 @@ def test_realizations_that_repeat_others_are_refused():
 
     with refused("few", "seed", 130, 30):
         diagnosed(few)
+
+
+class Wrong(Plain):
+    """A simulator that says that it widens its beam, and what it does with effects instead."""
+
+    def __init__(self, wrong):
+        super().__init__(effects=("beam_width",))
+        object.__setattr__(self, "wrong", wrong)
+
+    def simulate(self, seed, effects=(), sky=None):
+        return self.wrong(seed, effects)
+
+
+def noisier(seed, effects):
+    """Draw further noise, a tenth of the other, when there are effects."""
+    maps = Plain().simulate(seed, effects)
+    more = np.random.default_rng(seed + 1).normal(scale=3.0 * bool(effects), size=3072)
+    return {"V": {"a": maps["V"]["a"] + more, "b": maps["V"]["b"]}}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "word"),
+    [
+        (lambda seed, effects: Plain().simulate(seed), "ignores"),
+        (lambda seed, effects: Plain().simulate(seed + 7 * bool(effects), effects), "draws"),
+        (noisier, "draws"),
+    ],
+    ids=["ignores", "other sky and noise", "other noise"],
+)
+def test_an_effect_has_to_change_the_maps_of_a_seed_and_nothing_else(wrong, word):
+    with refused("Wrong", "beam_width", word):
+        diagnosed(Wrong(wrong))
+
+
+def test_seeds_are_told_apart_where_maps_are_observed():
+    def masked(seed, effects=()):
+        maps = Plain().simulate(seed, effects)["V"]
+        return {f"V:{name}": np.where(np.arange(3072) < 20, healpy.UNSEEN, one) for name, one in maps.items()}
+
+    masked.effects = ("beam_width",)
+    data = list(masked(3).values())
+    assert mcsim.diagnose(mcsim.ExternalModel(MODEL, masked), data, settings=FEW).agreement.effects == ("beam_width",)
