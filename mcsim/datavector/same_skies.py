@@ -1,17 +1,21 @@
 """Simulate data vectors of the same skies without effects and with them: in typical skies, or in constrained ones."""
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Literal
 
+import healpy
 import numpy as np
 
-from mcsim import config
+from mcsim import config, systematics
 from mcsim.datavector.analysis import Analysis, Job
 from mcsim.datavector.campaign import Ask, after_jobs, constrained_jobs
 from mcsim.datavector.wiener_filter import shared_sky
 from mcsim.support.arrays import Alm, Map, Matrix, Vector
+
+SMALL = 2e-3  #: gain of a channel that observed skies may have in them: responses are wrong by less than this share
 
 Skies = Literal["reference", "typical", "constrained"]
 
@@ -27,21 +31,52 @@ class SameSkies:
     ask: Ask
     maps: Sequence[Map]
 
-    @cached_property
+    @property
     def observed(self) -> Alm:
         """Return the filtered sky of the maps, uK, shape (size,)."""
-        return shared_sky(self.analysis.model, self.maps)
+        return self.observed_with(())
+
+    def observed_with(self, found: Sequence[config.Effect]) -> Alm:
+        """Return the filtered sky of the maps if they have effects: without the gains that these are.
+
+        Notes
+        -----
+        A gain 1 + g of one channel is in the filtered sky with a weight w: its response there is 1 + w g times the true
+        one, and a fit gives g/(1 + w g). Gains up to SMALL, the steps of linear responses among them, stay.
+        """
+        return self._skies_by_gain(self.gains(found))
 
     @cached_property
-    def _before(self) -> dict[tuple[bool, bool], list[Vector]]:
+    def _skies_by_gain(self) -> Callable[[tuple[float, ...]], Alm]:
+        @cache
+        def sky(gains: tuple[float, ...]) -> Alm:
+            pairs = zip(self.maps, gains, strict=True) if gains else ((map_, 1.0) for map_ in self.maps)
+            given = [map_ if g == 1.0 else np.where(map_ == healpy.UNSEEN, map_, map_ / g) for map_, g in pairs]
+            return shared_sky(self.analysis.model, given)
+
+        return sky
+
+    def gains(self, found: Sequence[config.Effect]) -> tuple[float, ...]:
+        """Return the gain of each map that effects rescale as a whole; () if all are close to 1."""
+        model, library, by_channel = self.analysis.model, dict(self.analysis.library), []
+        for channel in model.survey.channels if found else ():
+            own = [one for one in found if one.channel in (None, channel.name)]
+            acting = [systematics.build(library[one.name], dict(one.parameters)) for one in own]
+            by_channel.append(systematics.rescaling(acting, channel.site))
+        if all(abs(gain - 1.0) <= SMALL for gain in by_channel):
+            return ()
+        return tuple(by_channel[part.channel] for part in model.parts)
+
+    @cached_property
+    def _before(self) -> dict[tuple[bool, bool, tuple[float, ...]], list[Vector]]:
         """Return data vectors without any effect, as many as were needed so far.
 
-        Keys are True for constrained skies, and for an external simulator.
+        Keys are True for constrained skies, and for an external simulator; and the gains that these skies are without.
         """
-        return {(constrained, external): [] for constrained in (False, True) for external in (False, True)}
+        return defaultdict(list)
 
     @cached_property
-    def _ahead(self) -> dict[tuple[str, int, int, bool], Matrix]:
+    def _ahead(self) -> dict[tuple[str, int, int, bytes], Matrix]:
         """Return what was simulated ahead, by all that tells such jobs apart."""
         return {}
 
@@ -62,7 +97,7 @@ class SameSkies:
         """
         kinds = [(effect, self.skies_of(effect)) for effect in each]
         sets = [([effect], kind == "constrained", None if kind == "reference" else skies) for effect, kind in kinds]
-        jobs = [job for one in sets for job in self._jobs(*one)]
+        jobs = [job for one in sets for job in self._jobs(*one, there=one[0])]
         self._ahead.update(zip(map(_key, jobs), self.ask(jobs) if jobs else [], strict=True))
 
     def of_reference(self, found: Sequence[config.Effect], skies: int | None = None) -> Matrix:
@@ -70,21 +105,28 @@ class SameSkies:
         return self._simulated(self._jobs(found, False, skies))
 
     def pair(self, found: Sequence[config.Effect], skies: int, constrained: bool) -> tuple[Matrix, Matrix]:
-        """Return data vectors of the same skies without effects and with them."""
-        jobs = self._jobs(found, constrained, skies)
+        """Return data vectors of the same skies without effects and with them, which the observed maps have too."""
+        jobs = self._jobs(found, constrained, skies, there=found)
         after, source = self._simulated(jobs), jobs[0].source
-        before = self._before[constrained, source is not None]
+        before = self._before[constrained, source is not None, self.gains(found) if constrained else ()]
         if (first := len(before)) < skies:
-            same = [replace(job, source=source) for job in self._jobs((), constrained, skies, first)]
+            same = [replace(job, source=source) for job in self._jobs((), constrained, skies, first, found)]
             before.extend(self._simulated(same)[first - skies :])
         return np.stack(before[:skies]), after
 
-    def _jobs(self, found: Sequence[config.Effect], constrained: bool, skies: int | None, first: int = 0) -> list[Job]:
+    def _jobs(
+        self,
+        found: Sequence[config.Effect],
+        constrained: bool,
+        skies: int | None,
+        first: int = 0,
+        there: Sequence[config.Effect] = (),
+    ) -> list[Job]:
         """List the jobs that simulate effects; of skies that are not constrained, always from the first one on."""
         if not constrained or skies is None:
             jobs = after_jobs(self.analysis, found, skies)
         else:
-            jobs = constrained_jobs(self.analysis, found, self.observed, range(first, skies))
+            jobs = constrained_jobs(self.analysis, found, self.observed_with(there), range(first, skies))
         source = self.analysis.source_of(found, given_sky=constrained)
         return [replace(job, slices=True, source=source) for job in jobs]
 
@@ -95,5 +137,5 @@ class SameSkies:
         return np.concatenate([rows for rows in known.values() if rows is not None])
 
 
-def _key(job: Job) -> tuple[str, int, int, bool]:
-    return job.simulated, job.first, job.count, job.observed is not None
+def _key(job: Job) -> tuple[str, int, int, bytes]:
+    return job.simulated, job.first, job.count, b"" if job.observed is None else job.observed.tobytes()

@@ -159,6 +159,10 @@ class DataSet(ABC, Generic[Data]):
         """Return data vectors of the same skies without effects and with them; None if errors do not need them."""
         return None
 
+    def rescaled(self, found: Sequence[config.Effect]) -> bool:
+        """Return True if responses to effects depend on what these have done to the sky that the data are of."""
+        return False
+
     def templates(self) -> Matrix:
         """Return the templates for these data, shape (p, K)."""
         return self.context.templates

@@ -92,7 +92,8 @@ def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> At
             bend = context.null.whiten_templates(t - context.templates[:, columns])
             tables = tables_beside(context.candidates, best.members, best.fit, bend, context.settings.nonlinear_sigma)
             moved = [(step, None if one is None else data.pair(one)) for step, one in tables]
-            slopes = [None if one is None else (one[1] - pair[1]) / step for step, one in moved]
+            # The skies of responses are those without the gain of the effects, which moves as well.
+            slopes = [None if one is None else (one[1] - one[0] - (pair[1] - pair[0])) / step for step, one in moved]
             fit = with_tangents(context.null, t, fit, slopes)
     return replace(found, explanations=(replace(best, fit=fit), *found.explanations[1:]))
 

@@ -88,6 +88,10 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         before, after = self.same_skies.pair(found, skies, True)
         return before[:, :size], after[:, :size]
 
+    def rescaled(self, found: Sequence[config.Effect]) -> bool:
+        """Return True if the observed sky has to be found without the gain that effects are."""
+        return bool(self.same_skies.gains(found))
+
     def templates(self) -> Matrix:
         """Return the templates; those that depend on the very sky are measured on the observed one if it departs."""
         context, t, settings = self.context, self.context.templates.copy(), self.context.settings

@@ -141,7 +141,8 @@ class Refiner:
                 now.t[:, columns] = 0.0
             return True
         at, changes, pair = answer
-        if nonlinear:
+        there = candidate.table(candidate.with_coordinates(at, np.eye(len(at))))
+        if nonlinear or self.data.rescaled([there]):
             now.t[:, columns] += self._beyond(now.t[:, columns], at, changes.mean(axis=0))
         if stochastic:
             now.candidates[index] = replace(candidate, scatter=self.data.scatter(changes), shape_error=None)

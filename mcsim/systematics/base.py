@@ -27,6 +27,8 @@ Map = NDArray[np.float64]
 Draw = Callable[[str], np.random.Generator]
 """From the name of a stage to its stream of random numbers in this realization."""
 
+UNIFORM = 1e-9  #: relative departure of a beam from a multiple of another one that is round-off
+
 
 @dataclass(frozen=True)
 class Pointing:
@@ -340,6 +342,18 @@ def seen_through(acting: Sequence[Effect], site: Site, displacing: Sequence[Effe
     for effect in acting if displacing is None else displacing:
         beam = effect.pointing(beam, site) if effect.amplitude != 0.0 else beam
     return beam
+
+
+def rescaling(acting: Iterable[Effect], site: Site) -> float:
+    """Return the factor by which effects rescale all signal of a channel, of those that do nothing else to its beam."""
+    found, before = 1.0, site.beam.blm
+    for effect in acting:
+        after = effect.beam(site.beam, site).blm if effect.amplitude != 0.0 else before
+        if after is not before and after.shape == before.shape:
+            factor = float(np.vdot(before, after).real / np.vdot(before, before).real)
+            alike = np.linalg.norm(after - factor * before) <= UNIFORM * np.linalg.norm(after)
+            found *= factor if alike and factor > 0.0 else 1.0
+    return found
 
 
 def spread_of(acting: Iterable[Effect]) -> float:
