@@ -9,8 +9,8 @@ from mcsim import config
 from mcsim.datavector.candidate import Candidate, columns_of, parts_of, scatters_of
 from mcsim.diagnosis.consistency import amplitudes
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
-from mcsim.diagnosis.nuisance import NuisanceResult, Regression, results
-from mcsim.diagnosis.refine import Refined
+from mcsim.diagnosis.nuisance import NuisanceResult, Regression, results, with_priors
+from mcsim.diagnosis.refine import PartialExplanation, Refined
 from mcsim.diagnosis.result import CandidateResult, DiagnosisResult, EffectResult, EffectSet
 from mcsim.diagnosis.selection import Explanation
 from mcsim.errors import InputError
@@ -28,7 +28,7 @@ def result_of(
     """Return the result of a case from its final attribution and the reduction on held-out data."""
     context, found, partial = data.context, refined.attribution, refined.partial
     ensemble, null, model = context.ensemble, context.null, context.analysis.model
-    candidates, residuals = context.candidates, data.residual_maps()
+    residuals = data.residual_maps()
     return DiagnosisResult(
         case=case,
         kind=found.verdict,
@@ -43,7 +43,7 @@ def result_of(
         probability=found.probability,
         cosine=found.cosine,
         nearest_pvalue=found.singles[found.nearest].pvalue,
-        partial=() if partial is None else tuple(effects_of(candidates, partial.members, partial.fit)),
+        partial=() if partial is None else tuple(_partial(context, partial)),
         partial_left=None if partial is None else partial.left,
         held_out=reduction,
         nuisances=tuple(_nuisances(data, refined)),
@@ -73,6 +73,13 @@ def result_of(
         },
         configuration=config.to_json(context.run),
     )
+
+
+def _partial(context: DiagnosisContext, found: PartialExplanation) -> Iterator[EffectResult]:
+    """Return effects that do not explain all, with the priors of nuisances among them in their errors."""
+    members = [context.candidates[member] for member in found.members]
+    t = found.templates[:, columns_of(context.candidates, found.members)]
+    return effects_of(context.candidates, found.members, with_priors(context.null, t, found.fit, members))
 
 
 def _set_of(context: DiagnosisContext, one: Explanation) -> EffectSet:
@@ -167,7 +174,7 @@ def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[Candida
     for k, candidate in enumerate(candidates):
         columns = list(candidate.columns)
         try:
-            (alone,) = effects_of(candidates, (k,), found.singles[k])
+            (alone,) = effects_of(candidates, (k,), with_priors(null, t[:, columns], found.singles[k], [candidate]))
             amplitude, sigma, words = alone.amplitude, alone.sigma, alone.words
         except InputError:
             amplitude, sigma, words = float("nan"), float("nan"), "no such amplitude"

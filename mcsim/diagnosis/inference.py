@@ -1,7 +1,9 @@
 """Infer from one data set whether, where, by which effects and how far it departs from the model."""
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,16 +15,17 @@ from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import as_seen
 from mcsim.diagnosis.naming import agreeing, unconfirmed
+from mcsim.diagnosis.nuisance import with_priors
 from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.rivals import with_rivals
-from mcsim.diagnosis.selection import Attribution
+from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.diagnosis.words import refuted
 from mcsim.errors import InputError
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit
 from mcsim.stats.scattered import with_drawn_scatter, with_scatter, with_tangents
-from mcsim.support.arrays import Vector
+from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.numbers import measured
 
 
@@ -37,10 +40,10 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
         if (beside := with_rivals(data, refined, found)) is not None:
             data, refined = beside
             found, refusals = agreeing(data, refined, refined.attribution.if_named(data.context.settings))
-    context, refiner, partial = data.context, Refiner(data), refined.partial
+    context, refiner, detected = data.context, Refiner(data), refined.partial
     if exchanged:
         # An order of the maps in which the model fits says more than any effect.
-        found, partial = found.unexplained(), None
+        found, detected = found.unexplained(), None
     elif found.explanations:
         found = _with_errors(data, refined, found)
         found, reduction = confirmed(context, found, reduction_of(data, replace(refined, attribution=found)), notes)
@@ -48,12 +51,12 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
             refusals.append(why)
             found, reduction = found.unexplained(), None
     # What the rest of the data contradicts is not detected in it.
-    if partial is None and not (exchanged or refusals) and not found.faint and found.verdict == "unknown":
-        partial = refiner.detected_in(refined.templates, refined.candidates)
+    if detected is None and not (exchanged or refusals) and not found.faint and found.verdict == "unknown":
+        detected = refiner.detected_in(refined.templates, refined.candidates)
     notes += refusals
-    for own in found.explanations[:1] if partial is None else [partial]:
+    for own in found.explanations[:1] if detected is None else [detected]:
         notes += as_seen(context, own.members, own.fit)
-    return result_of(data, case, replace(refined, attribution=found, partial=partial), reduction, notes)
+    return result_of(data, case, replace(refined, attribution=found, partial=detected), reduction, notes)
 
 
 def confirmed(
@@ -79,23 +82,45 @@ def confirmed(
 
 
 def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> Attribution:
-    """Return the attribution, the best set with the errors that its amplitudes have with its effects in the data."""
-    context, best = data.context, found.explanations[0]
-    columns = columns_of(context.candidates, best.members)
-    t, fit = refined.templates[:, columns], best.fit
-    if scatters := scatters_of(refined.candidates, best.members):
-        fit = with_drawn_scatter(context.null, t, fit, scatters)  # those with which the fit was made
-        return replace(found, explanations=(replace(best, fit=fit), *found.explanations[1:]))
+    """Return the attribution, sets with priors of nuisances in errors, the best also with its effects in the data."""
+    context, every = data.context, found.explanations
+
+    def errors(one: Explanation, best: bool) -> Explanation:
+        members = [context.candidates[member] for member in one.members]
+        t, scatters = refined.templates[:, columns_of(context.candidates, one.members)], _scatters(refined, one)
+        null = context.null.with_extra_covariance(*scatters)
+        scattered = partial(_scattered, data, one.members, t, scatters) if best else _as_it_is
+        return replace(one, fit=with_priors(null, t, one.fit, members, scattered))
+
+    return replace(found, explanations=tuple(errors(one, place == 0) for place, one in enumerate(every)))
+
+
+def _as_it_is(fit: Fit) -> Fit:
+    return fit
+
+
+def _scatters(refined: Refined, one: Explanation) -> list[Matrix]:
+    return scatters_of(refined.candidates, one.members)
+
+
+def _scattered(data: DataSet[Any], members: Sequence[int], t: Matrix, scatters: Sequence[Matrix], first: Fit) -> Fit:
+    """Return the fit of a set with the errors that its amplitudes have with its effects in the data.
+
+    ``t`` are its templates, shape (p, K), and ``scatters`` those with which the fit was made.
+    """
+    context, fit = data.context, first
+    if scatters:
+        return with_drawn_scatter(context.null, t, fit, scatters)
     with suppress(InputError):  # between what was fitted and what can be
-        if pair := data.pair(tables_at(context.candidates, best.members, best.fit)):
+        if pair := data.pair(tables_at(context.candidates, members, first)):
             fit = with_scatter(context.null, t, fit, *pair)
-            bend = context.null.whiten_templates(t - context.templates[:, columns])
-            tables = tables_beside(context.candidates, best.members, best.fit, bend, context.settings.nonlinear_sigma)
+            bend = context.null.whiten_templates(t - context.templates[:, columns_of(context.candidates, members)])
+            tables = tables_beside(context.candidates, members, first, bend, context.settings.nonlinear_sigma)
             moved = [(step, None if one is None else data.pair(one)) for step, one in tables]
             # The skies of responses are those without the gain of the effects, which moves as well.
             slopes = [None if one is None else (one[1] - one[0] - (pair[1] - pair[0])) / step for step, one in moved]
             fit = with_tangents(context.null, t, fit, slopes)
-    return replace(found, explanations=(replace(best, fit=fit), *found.explanations[1:]))
+    return fit
 
 
 def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:

@@ -4,7 +4,7 @@ The simulations of the model draw the nuisances, so that mean and covariance con
 them. The drawn coordinates are known: their regression on the data vectors is the posterior.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.simulation.nuisance import Nuisance
-from mcsim.stats.gaussian import SimulatedGaussian, orthonormal
+from mcsim.stats.gaussian import Fit, SimulatedGaussian, orthonormal
 from mcsim.support.arrays import Matrix, Vector, divided
 
 MEASURED = 0.04
@@ -108,7 +108,7 @@ def with_nuisances(
 
     Such a candidate departs from the model only beyond its prior. Its template must therefore be the very direction in
     which the nuisance scatters the simulations; of a nuisance that the data hardly measure the regression is noise, and
-    its scatter small beside that of the data.
+    its scatter small beside that of the data: its prior goes into the error of its amplitude, by :func:`with_priors`.
     """
     assert ensemble.nuisances is not None  # the caller has asked
     drawn = ensemble.nuisances - ensemble.nuisances.mean(axis=0)
@@ -120,10 +120,44 @@ def with_nuisances(
         start = own.stop
         for place, candidate in enumerate(candidates):
             same = candidate.identity == (one.effect.name, one.channel) and not one.parameter_widths
-            if same and clear[own].all() and candidate.effect(**candidate.settings) == one.effect(**one.settings):
+            if not same or candidate.effect(**candidate.settings) != one.effect(**one.settings):
+                continue
+            if clear[own].all():
                 t[:, list(candidate.columns)] = response[own].T
                 found[place] = replace(candidate, nuisance=True)
+            else:
+                found[place] = replace(candidate, known=(response[own].T, one.sigma))
     return tuple(found), t
+
+
+def with_priors(
+    null: SimulatedGaussian,
+    t: Matrix,
+    found: Fit,
+    members: Sequence[Candidate],
+    scattered: Callable[[Fit], Fit] = lambda fit: fit,
+) -> Fit:
+    """Return a fit of templates of members, shape (p_raw, K), with the priors of nuisances among them in its errors.
+
+    ``scattered`` gives the fit the errors that its effects make, which concern the noise alone.
+
+    Notes
+    -----
+    The data cannot tell an effect from its nuisance: a fit theta = A x, A T = 1, finds the sum of both, and W, the
+    variance of the nuisance, is in that of theta whatever the weights are. The covariance of the simulations has
+    W r r' of it, r the response of the mean sky, which the weights evade where T differs from r, by noise or in the
+    very sky of the data. A W r r' A' is taken from the covariance, and W added: measurement and prior.
+    """
+    widths = np.concatenate([np.zeros(len(m.columns)) if m.known is None else m.known[1] for m in members])
+    if not widths.any():
+        return scattered(found)
+    parts = [np.zeros((len(t), len(m.columns))) if m.known is None else m.known[0] for m in members]
+    basis, back = orthonormal(null.whiten_templates(t))
+    seen = back @ basis.T @ null.whiten_templates(np.concatenate(parts, axis=1) * widths)
+    scale = (null.dof + found.chi2) / (found.dof - 2)
+    values, vectors = np.linalg.eigh(found.covariance - scale * seen @ seen.T)
+    noise = scattered(replace(found, covariance=(vectors * np.maximum(values, 0.0)) @ vectors.T))
+    return replace(noise, covariance=noise.covariance + np.diag(widths**2))
 
 
 def half_given_other(ensemble: NullEnsemble) -> Matrix:

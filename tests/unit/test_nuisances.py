@@ -15,7 +15,7 @@ from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element
 from mcsim.diagnosis.api import _key, describe
-from mcsim.diagnosis.nuisance import Regression, half_given_other, results, with_nuisances
+from mcsim.diagnosis.nuisance import Regression, half_given_other, results, with_nuisances, with_priors
 from mcsim.simulation import simulate
 from mcsim.simulation.nuisance import (
     DisturbedSurvey,
@@ -403,3 +403,27 @@ def test_a_candidate_that_is_a_nuisance_departs_beyond_its_prior_alone():
     assert right.amplitudes[0] == pytest.approx(1.0, rel=0.02)
     assert right.errors[0] > 0.1 > 2.0 * wrong.errors[0]
     assert with_nuisances(known, known.gaussian, priors[:1], candidates[:1], bank)[0][0].nuisance is False
+
+
+def test_the_error_of_a_weakly_measured_nuisance_has_its_prior():
+    """In the sky of the data the response is another one than in the mean, whose scatter the covariance has."""
+    rng, p, width = np.random.default_rng(11), 12, 0.1
+    mean_sky = rng.normal(size=(p, 1)) * 4.0 / width / np.sqrt(p)
+    root, drawn, simulations = linear(rng, p, 3000, mean_sky, np.array([width]))
+    known = ensemble_of(simulations, drawn)
+    kind = systematics.get("calibration")
+    only = numbered([Candidate(kind, "W1", (0,))])
+    this_sky = mean_sky + root @ rng.normal(size=(p, 1)) * 3.0 / width / np.sqrt(p)
+    (one,), t = with_nuisances(known, known.gaussian, [Nuisance(kind, "W1", (width,))], only, this_sky)
+    assert not one.nuisance
+    np.testing.assert_array_equal(t, this_sky)
+    null, pulls = known.gaussian, []
+    for _ in range(500):
+        x = simulations.mean(axis=0) + root @ rng.normal(size=p) + this_sky[:, 0] * (0.5 + width * rng.normal())
+        fit = null.fit(x, t)
+        pulls.append([(each.amplitudes[0] - 0.5) / each.errors[0] for each in (fit, with_priors(null, t, fit, [one]))])
+    without, found = np.std(pulls, axis=0)
+    assert without > 1.5
+    assert abs(found - 1.0) < 4.0 / np.sqrt(2.0 * 500)
+    alone = replace(one, known=None)
+    assert with_priors(null, t, fit, [alone]) is fit
