@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -19,7 +20,7 @@ from mcsim.diagnosis.nuisance import with_nuisances
 from mcsim.diagnosis.selection import Attribution
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
-from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_in_folds, calibrate_on
+from mcsim.stats.look_elsewhere import Calibration, GlobalTest, calibrate, calibrate_in_folds, calibrate_on, global_test
 from mcsim.support.arrays import Matrix, Vector
 
 Data = TypeVar("Data")
@@ -38,6 +39,7 @@ class DiagnosisContext:
     sky_scatter: Vector  # relative scatter of each candidate's response among skies, (candidates,)
     templates: Matrix  # (p, K), noisy ones without the elements that are only noise
     groups: WhitenedTemplates  # the same, white, candidate by candidate
+    always: WhitenedTemplates  # those of candidates that are proposed whatever the data are
 
     @property
     def run(self) -> config.RunConfig:
@@ -81,7 +83,7 @@ def context(analysis: Analysis, ensemble: NullEnsemble, bank: TemplateBank) -> D
         candidates, templates = with_nuisances(ensemble, null, analysis.nuisances, candidates, templates)
     groups = null.whiten_groups(templates, [candidate.columns for candidate in candidates])
     calibration = calibration_of(ensemble, null, groups)
-    return DiagnosisContext(analysis, ensemble, bank, null, candidates, calibration, scatter, templates, groups)
+    return DiagnosisContext(analysis, ensemble, bank, null, candidates, calibration, scatter, templates, groups, groups)
 
 
 def calibration_of(ensemble: NullEnsemble, null: SimulatedGaussian, groups: WhitenedTemplates) -> Calibration:
@@ -107,6 +109,12 @@ class DataSet(ABC, Generic[Data]):
     @abstractmethod
     def x(self) -> Vector:
         """Return the data vector, shape (p,)."""
+
+    @cached_property
+    def gap(self) -> GlobalTest:
+        """Return the test of the data against the model, with templates that were known before the data."""
+        known = self.context
+        return global_test(known.null, self.x, known.always, known.calibration)
 
     @property
     def realizations(self) -> int:

@@ -18,7 +18,6 @@ from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.nuisance import half_given_other
 from mcsim.diagnosis.selection import Attribution
 from mcsim.errors import InputError
-from mcsim.stats.look_elsewhere import global_test
 from mcsim.support.arrays import Map, Matrix, Vector
 
 
@@ -95,7 +94,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
     def templates(self) -> Matrix:
         """Return the templates; those that depend on the very sky are measured on the observed one if it departs."""
         context, t, settings = self.context, self.context.templates.copy(), self.context.settings
-        if global_test(context.null, self.x, context.groups, context.calibration).pvalue > settings.alpha:
+        if self.gap.pvalue > settings.alpha:
             return t
         fixed = [c.random_response or c.nuisance or c.parametrization.mean_response for c in context.candidates]
         depends = ~np.array(fixed) & (context.sky_scatter >= settings.sky_scatter)

@@ -7,7 +7,7 @@ import numpy as np
 
 from mcsim.datavector.candidate import Candidate, columns_of, coordinates_of, effects_at, lost, parts_of, scatters_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
-from mcsim.diagnosis.selection import Attribution, Selection, attribute
+from mcsim.diagnosis.selection import Attribution, Selection, attributed
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit
 from mcsim.stats.scattered import Acting, with_drawn_scatter
@@ -212,7 +212,8 @@ class Refiner:
 
     def _attribute(self, t: Matrix, candidates: Sequence[Candidate]) -> Attribution:
         known = self.context
-        return attribute(known.null, self.data.x, t, candidates, known.calibration, known.settings)
+        chosen = Selection(known.null, self.data.x, t, candidates, known.calibration, known.settings)
+        return attributed(chosen, self.data.gap)
 
     def _together(self, candidates: Sequence[Candidate], t: Matrix, members: tuple[int, ...]) -> Matrix | None:
         """Return templates that are exact for effects that act together, at about their fitted amplitudes.

@@ -131,11 +131,19 @@ def attribute(
     its fitted part (at most that of the whole fit); the sum over members makes both tests noncentral, in the least
     favourable direction. The prior of a set is k! times the product of its candidates' shares of the weight.
     """
-    settings = settings or DiagnosisSettings()
-    selection = Selection(null, x, t, candidates, calibration, settings)
+    return attributed(Selection(null, x, t, candidates, calibration, settings or DiagnosisSettings()))
+
+
+def attributed(selection: "Selection", gap: GlobalTest | None = None) -> Attribution:
+    """Return :func:`attribute` of the fields of a selection.
+
+    ``gap``: the test of the data against the model, with templates that do not follow from the data: what is measured
+    anew once they were looked at would be another chance. None: the test with the templates of the selection.
+    """
+    null, candidates, settings = selection.null, selection.candidates, selection.settings
     first = selection.searches[0]
     groups, y = first.groups, first.y
-    found = global_test(null, x, groups, calibration)
+    found = global_test(null, selection.x, groups, selection.calibration) if gap is None else gap
     delta_chi2 = groups.delta_chi2(y)
     nearest = int(np.argmax(delta_chi2))
     signal = null.hartlap_factor * delta_chi2[nearest] - groups.sizes[nearest]

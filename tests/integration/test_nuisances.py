@@ -109,8 +109,12 @@ def test_p_is_uniform_over_the_prior_and_not_without_the_nuisances(declared, und
 def test_an_effect_is_named_beside_nuisances_that_are_far_from_zero(run, declared, undeclared):
     drawn = tables(run, 5, 0)
     maps = maps_of(run, ELLIPSE, *drawn)
-    found = diagnose_data(ObservedMaps(declared, maps, ask), "declared")
+    data = ObservedMaps(declared, maps, ask)
+    found = diagnose_data(data, "declared")
     assert [(one.name, one.channel) for one in found.effects] == [("beam_ellipticity", "W1")]
+    # Templates are measured anew for the effect, and not for the gap: once the data were looked at it would be another.
+    assert not np.array_equal(found.templates, declared.templates)
+    assert found.test == global_test(declared.null, data.x, declared.groups, declared.calibration)
     assert abs(found.effects[0].amplitude - 0.5) < 4.0 * found.effects[0].sigma
     for one, truth in zip(found.nuisances, drawn, strict=True):
         assert (one.name, one.channel) == (truth.name, truth.channel)

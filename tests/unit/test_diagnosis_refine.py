@@ -11,7 +11,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.refine import Refiner
 from mcsim.diagnosis.selection import attribute
 from mcsim.stats.gaussian import SimulatedGaussian
-from mcsim.stats.look_elsewhere import calibrate
+from mcsim.stats.look_elsewhere import calibrate, global_test
 from mcsim.systematics import Effect, Parametrization
 
 P = 50
@@ -69,8 +69,9 @@ class Instrument:
     def refined(self, x: np.ndarray, sets=()):
         bank = SimpleNamespace(curvature=self.curvature)
         context = SimpleNamespace(null=self.null, calibration=self.calibration, bank=bank, settings=DiagnosisSettings())
-        own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter}
-        data = SimpleNamespace(context=context, x=x, realizations=1, **own)
+        own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter, "rescaled": lambda tables: False}
+        gap = global_test(self.null, x, self.null.whiten_groups(self.t, [(0,), (1,), (2,)]), self.calibration)
+        data = SimpleNamespace(context=context, x=x, realizations=1, gap=gap, **own)
         return Refiner(data).run(self.t, self.candidates, sets)
 
 
