@@ -11,6 +11,7 @@ import numpy as np
 from mcsim.datavector.wiener_filter import Model, Part, sky_variance
 from mcsim.ensemble.maps import POINTING, file_names, first_realization
 from mcsim.errors import InputError
+from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.sphere.header import first_table, opened
 from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Map, reals
@@ -29,6 +30,7 @@ def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
     broken = int(np.sum(~np.isfinite(map_)))
     if broken:
         raise InputError(f"{name} has {broken} pixels that are not finite; mark what was not observed as UNSEEN.")
+    map_ = np.where(map_ > UNSEEN_BELOW, map_, healpy.UNSEEN)  # of single precision it is another number
     unseen = map_ == healpy.UNSEEN
     fiducial, limits = part.precision > 0, model.settings
     lost = float(np.mean(unseen[fiducial]))

@@ -18,6 +18,7 @@ from mcsim import config
 from mcsim.config import arrays
 from mcsim.errors import InputError
 from mcsim.sphere import header
+from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Alm, Map, reals
 from mcsim.support.folders import unreadable
@@ -119,7 +120,7 @@ def _in_uk(one: Any, part: Part, where: str) -> Map:
     found = reals(one, f"the map {part.name} of {where}", healpy.UNSEEN)
     unit = getattr(one, "attrs", {}).get("units")
     factor = header.to_uk(unit, Path(f"the map {part.name} of {where}"), part.frequency_ghz)
-    return found if factor == 1.0 else np.where(found == healpy.UNSEEN, found, factor * found)
+    return np.where((found > UNSEEN_BELOW) | ~np.isfinite(found), factor * found, healpy.UNSEEN)
 
 
 def parts_of(run: config.RunConfig) -> Iterator[Part]:

@@ -10,7 +10,9 @@ import pytest
 import mcsim
 from mcsim import config
 from mcsim.datavector.campaign import with_effects
+from mcsim.diagnosis import api
 from mcsim.ensemble.external import source_of
+from mcsim.ensemble.external_maps import in_order, parts_of
 from mcsim.simulation import sampled
 from mcsim.simulation.survey import survey
 from refusals import refused
@@ -144,3 +146,16 @@ def test_seeds_are_told_apart_where_maps_are_observed():
     masked.effects = ("beam_width",)
     data = list(masked(3).values())
     assert mcsim.diagnose(mcsim.ExternalModel(MODEL, masked), data, settings=FEW).agreement.effects == ("beam_width",)
+
+
+def test_what_is_not_observed_may_be_of_single_precision():
+    """As ``float32`` the value UNSEEN is another number, and the map is not refused for the size of it."""
+    parts = tuple(parts_of(config.load(MODEL)))
+    run, maps = config.load(MODEL), np.float32(native(5, 1)[0])
+    maps[:, :30] = healpy.UNSEEN
+    given = dict(zip(("V:a", "V:b"), maps, strict=True))
+    assert all(np.all(one[:30] == healpy.UNSEEN) for one in in_order(given, parts, "here"))
+    model = api.analysis_of(run, settings=SETTINGS.of_a_simulation()).model
+    for found, one in zip(api.checked(model, given), maps, strict=True):
+        np.testing.assert_array_equal(found[:30], healpy.UNSEEN)
+        np.testing.assert_array_equal(found[30:], np.float64(one[30:]))
