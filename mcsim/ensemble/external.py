@@ -3,7 +3,7 @@
 import inspect
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from importlib import import_module
@@ -119,8 +119,9 @@ def _code(parts: tuple[Part, ...], label: str, made: bytes, given: Any) -> Code:
     None: that copy is from a module.
     """
     simulator = _loaded(made)
-    method, effects = _method(simulator), getattr(simulator, "effects", ())
-    if isinstance(effects, str) or not all(isinstance(name, str) for name in effects):
+    method, effects = _method(simulator), getattr(simulator, "effects", None) or ()
+    listed = isinstance(effects, Iterable) and not isinstance(effects, str)
+    if not listed or not all(isinstance(name, str) for name in effects):
         raise InputError(f"{label}.effects = {effects!r} is no list of names; give those of effects that it can add.")
     takes = inspect.signature(method).parameters
     if not takes or (effects and "effects" not in takes):

@@ -159,3 +159,13 @@ def test_what_is_not_observed_may_be_of_single_precision():
     for found, one in zip(api.checked(model, given), maps, strict=True):
         np.testing.assert_array_equal(found[:30], healpy.UNSEEN)
         np.testing.assert_array_equal(found[30:], np.float64(one[30:]))
+
+
+def test_what_a_simulator_says_of_effects():
+    run = config.load(MODEL)
+    for effects in (None, (), []):
+        assert source_of(run, Plain(effects=effects)).effects == ()
+    assert source_of(run, Plain(effects={"beam_width"})).effects == ("beam_width",)
+    for effects in ("beam_width", 3, (1,)):
+        with refused("Plain.effects", repr(effects)):
+            source_of(run, Plain(effects=effects))
