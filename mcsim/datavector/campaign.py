@@ -141,6 +141,27 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
     return {purpose: replace(job, slices=analysis.of_maps) for purpose, job in jobs.items()}
 
 
+def check_count(analysis: Analysis, simulations: int | None) -> None:
+    """Raise InputError for a number of simulations, or of stored realizations, that cannot be enough for a covariance.
+
+    How many are enough is known once some say how many elements are independent.
+    """
+    size, settings, source = len(analysis.elements), analysis.settings, analysis.source
+    stored = None if source is None else source.count
+    if simulations is not None and simulations <= size:
+        raise InputError(
+            f"{simulations} simulations are too few for the {size} elements of the data vector; give more than {size}, "
+            f"better {settings.without_shrinkage().sims_per_element * size}."
+        )
+    if stored is not None and simulations is not None and stored < simulations:
+        raise InputError(f"{simulations} simulations are asked for, but {stored} are stored; ask for as many at most.")
+    if source is not None and stored is not None and stored <= size and simulations is None:
+        raise InputError(
+            f"{stored} realizations of {source.label} are too few for a data vector of {size} elements; give more than "
+            f"{size}, {settings.sims_per_element} for each independent one, or leave effects out (--without)."
+        )
+
+
 def is_of_the_model(job: Job) -> bool:
     """Return True for simulations of the model for its covariance."""
     return config.from_json(job.simulated).ensemble.seed == _COVARIANCE
@@ -264,11 +285,6 @@ def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool
         return run(list(jobs))
     size, settings = len(analysis.elements), analysis.settings
     few, source = settings.pilot_sims_per_element * size, analysis.source
-    if source is not None and source.count is not None and source.count <= size:
-        raise InputError(
-            f"{source.count} realizations of {source.label} are too few for a data vector of {size} elements; give "
-            f"more than {size}, {settings.sims_per_element} for each independent one, or leave effects out (--without)."
-        )
     # What is needed in any case keeps workers busy to the end of the pilot; external simulations wait for its verdict.
     first = run([one for one in jobs if (one.number < few if one.kind == "null" else source is None)])
     drawn = np.concatenate([result[:, :size] for purpose, result in first.items() if purpose.kind == "null"])

@@ -178,6 +178,7 @@ def describe(
     check_asked(analysis, asked)
     if data is not None and table is None:
         read_maps(analysis.model, data)
+    campaign.check_count(analysis, settings.simulations)
     planned, size = campaign.plan(analysis, settings.simulations), len(analysis.elements)
     jobs = planned.values()
     number = sum(job.count for job in jobs if job.source is None)
@@ -262,15 +263,8 @@ def _learned(
     ask: campaign.Ask,
 ) -> tuple[NullEnsemble, TemplateBank]:
     """Simulate a model or load it from the cache; single simulations stay for the verdict after a first one alone."""
-    size, simulations = len(analysis.elements), analysis.settings.simulations
-    if simulations is not None and simulations <= size:
-        raise InputError(
-            f"{simulations} simulations are too few for the {size} elements of the data vector; give at least "
-            f"{2 * size}, better {analysis.settings.without_shrinkage().sims_per_element * size}."
-        )
-    stored = None if analysis.source is None else analysis.source.count
-    if stored is not None and simulations is not None and stored < simulations:
-        raise InputError(f"{simulations} simulations are asked for, but {stored} are stored; ask for as many at most.")
+    simulations = analysis.settings.simulations
+    campaign.check_count(analysis, simulations)
     name = f"diagnose/{key}.zarr"
 
     def fill(scratch: Path) -> None:

@@ -58,7 +58,7 @@ def test_what_cannot_be_done_is_said_before_anything_is_learned(small, folder):
         ({"settings": DiagnosisSettings(without=("beam_elipticity",))}, ("beam_elipticity", "beam_ellipticity")),
         ({"data": [np.zeros(3072)]}, ("1 maps", 4)),
         ({"data": [np.zeros(48)] * 4}, ("V1:half1", "nside 2", 16)),
-        ({"settings": DiagnosisSettings(simulations=20)}, ("20 simulations", 173, 346)),
+        ({"settings": DiagnosisSettings(simulations=20)}, ("20 simulations", 173, 1730)),
     ):
         with refused(*named):
             mcsim.diagnose(**({"model": small.run, "data": folder, "output": folder / "new" / "verdict"} | changes))

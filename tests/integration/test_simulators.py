@@ -169,3 +169,17 @@ def test_what_a_simulator_says_of_effects():
     for effects in ("beam_width", 3, (1,)):
         with refused("Plain.effects", repr(effects)):
             source_of(run, Plain(effects=effects))
+
+
+def test_a_dry_run_refuses_the_counts_that_a_diagnosis_refuses():
+    size = len(api.analysis_of(config.load(MODEL)).elements)
+    every = mcsim.DiagnosisSettings(simulations=size - 1)
+    for model, settings, words in (
+        (config.load(MODEL), every, (size - 1, size)),
+        (mcsim.ExternalModel(MODEL, native(1, 20)), mcsim.DiagnosisSettings(), (20, size)),
+        (mcsim.ExternalModel(MODEL, native(1, 20)), mcsim.DiagnosisSettings(simulations=500), (20, 500)),
+    ):
+        with refused(*words):
+            api.describe(model, settings)
+        with refused(*words):
+            mcsim.diagnose(model, list(native(5, 1)[0]), settings=settings)
