@@ -38,6 +38,11 @@ class Nuisance:
     parameter_widths: Mapping[str, float] = field(default_factory=dict)
 
     @property
+    def centre(self) -> Effect:
+        """Return the effect with the parameters that are given, or its own, which its coordinates do not change."""
+        return self.effect(**self.settings)
+
+    @property
     def title(self) -> str:
         """Return the effect in words, with channel and settings."""
         drawn = [f"{key} ± {width:g}" for key, width in self.parameter_widths.items()]
@@ -110,7 +115,7 @@ def nuisances_of(run: config.RunConfig, library: Library | None = None) -> tuple
     for number, entry in enumerate(run.nuisances):
         with standing(run, f"nuisance[{number}]"):
             one = _nuisance(run, entry, library)
-            if any((one.effect, one.channel, one.settings) == (e.effect, e.channel, e.settings) for e in found):
+            if any((one.channel, one.centre) == (e.channel, e.centre) for e in found):
                 where = "" if one.channel is None else f" of {one.channel}"
                 raise InputError(
                     f"nuisance {one.effect.name}{where} is declared twice; keep one table, with its own width."

@@ -168,6 +168,12 @@ def test_a_nuisance_is_declared_once():
     check_nuisances(model(one, one | {"channel": "W1"}))
     with refused("calibration", "V1", "twice"):
         check_nuisances(model(one, one | {"width": 0.02}))
+    # A parameter that is spelled out is the same as its default, and another value another nuisance.
+    one = {"effect": "foreground_residual", "width": 3.0}
+    usual = systematics.get("foreground_residual")().spectral_index
+    with refused("foreground_residual", "twice"):
+        check_nuisances(model(one, one | {"parameters": {"spectral_index": usual}}))
+    check_nuisances(model(one, one | {"parameters": {"spectral_index": usual + 1.0}}))
 
 
 def test_nuisances_are_part_of_a_diagnosis_and_not_of_an_ensemble(tmp_path):
