@@ -51,7 +51,7 @@ class Code(Source):
             return _method(_loaded(self.made))(seed_of(seed, realization), **own)
         except InputError:
             raise
-        except Exception as error:  # whatever a foreign program does
+        except (Exception, SystemExit) as error:  # whatever a foreign program does
             reason = str(error).partition("\n")[0]
             raise RunError(
                 f"{self.words(seed, realization)} fails ({type(error).__name__}: {reason}); mend it."
@@ -194,7 +194,7 @@ def _resolved(text: str, run: str, written: str) -> Any:
         return _instance(found, run)
     except InputError:
         raise
-    except Exception as error:  # whatever a foreign module does when it is imported
+    except (Exception, SystemExit) as error:  # whatever a foreign module does when it is imported
         reason = str(error).partition("\n")[0]
         raise InputError(
             f"simulator = {text!r} cannot be loaded ({type(error).__name__}: {reason}); mend or install it."

@@ -13,6 +13,7 @@ from mcsim.datavector.campaign import with_effects
 from mcsim.diagnosis import api
 from mcsim.ensemble.external import source_of
 from mcsim.ensemble.external_maps import in_order, parts_of
+from mcsim.errors import RunError
 from mcsim.simulation import sampled
 from mcsim.simulation.survey import survey
 from refusals import refused
@@ -169,6 +170,18 @@ def test_what_a_simulator_says_of_effects():
     for effects in ("beam_width", 3, (1,)):
         with refused("Plain.effects", repr(effects)):
             source_of(run, Plain(effects=effects))
+
+
+def test_a_simulator_that_exits_fails_with_its_seed(tmp_path):
+    def exits(seed):
+        raise SystemExit("no licence")
+
+    source = source_of(config.load(MODEL), exits)
+    with refused("exits", "seed", "SystemExit", source.words(0, 0).split()[-1], by=RunError):
+        source.maps(0, 0)
+    (tmp_path / "exits.py").write_text("raise SystemExit(3)")
+    with refused("exits.py:simulate", "SystemExit"):
+        source_of(config.load(MODEL), f"{tmp_path / 'exits.py'}:simulate")
 
 
 def test_a_dry_run_refuses_the_counts_that_a_diagnosis_refuses():
