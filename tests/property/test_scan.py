@@ -1,5 +1,6 @@
 import healpy
 import numpy as np
+import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numba import njit
@@ -9,6 +10,8 @@ from mcsim.instrument.scan.limit import caustics, limit_moments
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.pointing import pointing, quarter_turns, ring_pixel
 
+# Scans that miss phases of the spin are drawn, too.
+pytestmark = pytest.mark.filterwarnings("ignore:samples of A every")
 SETTINGS = settings(derandomize=True, deadline=None, max_examples=60)
 
 
