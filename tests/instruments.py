@@ -1,11 +1,20 @@
 """The small instrument of many tests of a diagnosis: two channels in two halves of a year."""
 
+from collections.abc import Iterable
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
-from mcsim import config
+from mcsim import config, systematics
+from mcsim.datavector import campaign
+from mcsim.datavector.analysis import Job, analysis_of, data_vectors
 from mcsim.datavector.campaign import with_effects
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.diagnosis.context import DiagnosisContext, context
 from mcsim.simulation.survey import Survey, survey
+from mcsim.support.arrays import Matrix
+
+PROPOSED = ("beam_ellipticity", "pointing_offset", "noise_level", "dipole_modulation")
 
 
 def two_channels(
@@ -44,3 +53,17 @@ def data_of(
     """Return the survey of data of a run with another seed, and with an effect that the run lacks."""
     found = () if name is None else (config.Effect(name=name, channel=channel, parameters=parameters),)
     return survey(with_effects(replace(run, ensemble=replace(run.ensemble, seed=seed)), found))
+
+
+def ask(jobs: Iterable[Job]) -> list[Matrix]:
+    """Simulate data vectors in this process."""
+    return [data_vectors(job) for job in jobs]
+
+
+@lru_cache(maxsize=1)
+def learned_small() -> DiagnosisContext:
+    """Return what is learned of the small instrument, with PROPOSED effects alone."""
+    run = config.load(two_channels("small"))
+    without = [name for name in systematics.catalogue() if name not in PROPOSED]
+    analysis = analysis_of(run, without=without, settings=DiagnosisSettings(beam_orders=2))
+    return context(analysis, *campaign.learned(analysis, ask, 260, time_ordered=False))
