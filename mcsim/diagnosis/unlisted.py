@@ -189,8 +189,9 @@ class Reconstruction:
         if structure.split != ALIKE and structure.by_map:
             shape, share = replace(structure, split=ALIKE), np.zeros(len(self.scene.views))
             share[list(structure.views)] = structure.weights
-        effect, skies = plugin("unlisted", shape, theta, self.scene), 1 if structure.stage == "added" else SKIES
-        return None if effect is None else self.made([effect], share, skies)
+        effect = plugin("unlisted", shape, theta, self.scene)
+        own = structure.stage == "added" and self.search.exact  # scores of what is added are the same on every sky
+        return None if effect is None else self.made([effect], share, 1 if own else SKIES)
 
     def _moved(self, structure: Structure, theta: Vector) -> Vector:
         """Return what a beam that follows a wave makes of all scores, on skies that the data constrain."""

@@ -26,9 +26,9 @@ MOST = 3  #: largest number of structures
 SECOND = 0.1
 """Least fall of chi^2 of a further structure over that of the first: below it may be the square of the first."""
 
-FINALISTS, NEAR = 20, 5.0
-"""Structures that are compared by their responses on the sky of the data: how many at most, and within which difference
-of the evidence those of one stage and frame."""
+FINALISTS, NEAR, SPARE = 20, 5.0, 2
+"""Structures that are compared by their responses on the sky of the data: how many at most, within which difference of
+the evidence those of one stage and frame, and simulations for each of their scores if all of them judge."""
 
 RARE = 3.0
 """Odds against a structure that differs between splits, acts on sky or dipole alone, a cube, a halo, a signal from
@@ -226,17 +226,31 @@ class Search:
         wanted += _firsts(beside, [(self.grammar[k].acts_on, self.grammar[k].kind.endswith(ANY)) for k in beside])
         wanted += [k for k in order if values[order[0]] - values[k] < NEAR]
         wanted += _firsts(order, [(one.stage, one.acts_on, one.frame) for one in each])
-        return _firsts(wanted, [self.grammar[k].choice or k for k in wanted])[:FINALISTS]
+        chosen = _firsts(wanted, [self.grammar[k].choice or k for k in wanted])
+        return (chosen if self.exact else self._measurable(chosen))[:FINALISTS]
+
+    def _measurable(self, chosen: Sequence[int]) -> list[int]:
+        """Return the first of some structures of whose scores there are SPARE simulations each."""
+        kept, left = list[int](), len(self.simulations) // SPARE
+        for k in chosen:
+            if self.grammar[k].size <= left:
+                kept.append(k)
+                left -= self.grammar[k].size
+        return kept
 
     def judged(
         self, members: Sequence[int], scores: Vector, responses: Sequence[Response]
     ) -> tuple[Vector, Vector, list[Vector]]:
-        """Return evidence, fall of chi^2 and amplitudes of structures, each in its own scores.
+        """Return evidence, fall of chi^2 and amplitudes of structures.
 
-        These say all that maps tell of it. Those of a pattern that multiplies the sky leave out the monopoles and
-        dipoles of the product, which count besides.
+        Each is judged in its own scores, which say all that maps tell of it. Those of a pattern that multiplies the sky
+        leave out the monopoles and dipoles of the product, which count besides. By the isotropic filter the scores of
+        others tell more, and all are judged in those of all.
         """
-        fits = [self._fit_on_sky(k, scores, *one) for k, one in zip(members, responses, strict=True)]
+        if self.exact:
+            fits = [self._fit_on_sky(k, scores, *one) for k, one in zip(members, responses, strict=True)]
+        else:
+            fits = self._fits_in_all(members, scores, [made for _, made in responses])
         falls = np.array([fall for fall, _ in fits])
         return self._evidences(falls[:, None], members)[:, 0], falls, [amplitudes for _, amplitudes in fits]
 
@@ -248,7 +262,7 @@ class Search:
         """
         structure, null = self.grammar[member], self.nulls[member]
         x, t = structure.of(scores), structure.of(made)
-        if null is not None and (structure.of_variances or not self.exact):
+        if null is not None and structure.of_variances:
             fit = null.fit(x, t.T)
             return null.hartlap_factor * fit.delta_chi2 * self._share(member, scores), fit.amplitudes
         rows = structure.of(self.simulations)
@@ -266,6 +280,20 @@ class Search:
             scatter = float(np.var(rows @ (amplitudes @ coordinates), ddof=1))
             fall *= min(1.0, fall / scatter * (1.0 + 4.0 * np.sqrt(2.0 / len(rows))))
         return fall, amplitudes
+
+    def _fits_in_all(
+        self, members: Sequence[int], scores: Vector, responses: Sequence[Matrix]
+    ) -> list[tuple[float, Vector]]:
+        """Return falls of chi^2 and amplitudes of structures in the scores of all of them."""
+        simulations, x, *made = (
+            np.concatenate([self.grammar[k].of(one) for k in members], axis=-1)
+            for one in (self.simulations, scores, *responses)
+        )
+        null = SimulatedGaussian.from_simulations(simulations, floor=SMALL)
+        fits = [null.fit(x, one.T) for one in made]
+        shares = [self._share(k, scores) for k in members]
+        falls = [null.hartlap_factor * one.delta_chi2 * share for one, share in zip(fits, shares, strict=True)]
+        return list(zip(falls, [one.amplitudes for one in fits], strict=True))
 
     @cached_property
     def _low(self) -> NDArray[np.int64]:

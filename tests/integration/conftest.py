@@ -13,6 +13,8 @@ from distributed import Client, LocalCluster
 from matplotlib.figure import Figure
 
 from mcsim import cli, config
+from mcsim.datavector import campaign
+from mcsim.diagnosis import api
 from mcsim.ensemble import runner
 from mcsim.ensemble.runner import cluster
 from refusals import unnamed
@@ -36,6 +38,13 @@ def client() -> Iterator[Client]:
 def in_this_process(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let commands run on ``client`` instead of processes, whose start takes seconds."""
     monkeypatch.setattr(cluster, "local_client", lambda workers: nullcontext(client))
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Simulate what diagnoses ask for in this process, without workers, which cannot load what tests define."""
+    original = campaign.batch
+    monkeypatch.setattr(api, "batch", lambda workers: original(0))
 
 
 def table(**changes: Any) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from pictures import quick_pictures
 from refusals import refused
 
 NSIDE, LMAX, FWHM, SIGMA = 16, 24, 500.0, 30.0
+pytestmark = pytest.mark.usefixtures("here")
 MODEL = {
     "schema": 1,
     "name": "small",
@@ -50,13 +51,6 @@ SMALL |= {"noisy_skies": 12, "constrained_skies": 4}
 SETTINGS = mcsim.DiagnosisSettings(library=LIBRARY, **SMALL)
 
 FEW = replace(SETTINGS, simulations=80)
-
-
-@pytest.fixture(autouse=True)
-def here(monkeypatch):
-    """Simulate in this process."""
-    original = campaign.batch
-    monkeypatch.setattr(api, "batch", lambda workers: original(0))
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,7 @@ def test_litebird_sim_as_a_model_adds_an_effect_to_the_sky_that_it_is_given(monk
         assert np.std((after - before - expected)[seen]) < 0.02 * np.std(expected[seen])
 
 
+@pytest.mark.usefixtures("here")
 def test_realizations_that_repeat_others_are_refused():
     """Each would count as one of its own: the covariance would be too small, or singular."""
     stack = native(1, 70)
@@ -125,6 +126,7 @@ def noisier(seed, effects):
     return {"V": {"a": maps["V"]["a"] + more, "b": maps["V"]["b"]}}
 
 
+@pytest.mark.usefixtures("here")
 @pytest.mark.parametrize(
     ("wrong", "word"),
     [
@@ -139,6 +141,7 @@ def test_an_effect_has_to_change_the_maps_of_a_seed_and_nothing_else(wrong, word
         diagnosed(Wrong(wrong))
 
 
+@pytest.mark.usefixtures("here")
 def test_seeds_are_told_apart_where_maps_are_observed():
     def masked(seed, effects=()):
         maps = Plain().simulate(seed, effects)["V"]
