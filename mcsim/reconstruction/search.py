@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mcsim.reconstruction.grammar import ALIKE, ANY, INDICES, LOWEST, MEANS, Structure
 from mcsim.sphere import real
 from mcsim.stats.gaussian import SimulatedGaussian
-from mcsim.support.arrays import Matrix, Vector
+from mcsim.support.arrays import Matrix, Vector, divided
 
 LEVEL = 0.01  #: global p-value, all of the grammar charged, up to which a structure is there
 MOST = 3  #: largest number of structures
@@ -271,12 +271,14 @@ class Search:
             white = np.sqrt(self._low_null.hartlap_factor) * self._low_null.whiten_templates(made[:, self._low].T)
             known = known + white.T @ self._low_null.whiten(scores[self._low])
             information = information + white.T @ white
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+        scale = divided(1.0, np.sqrt(np.maximum(np.diag(information), 0.0)))
         sizes, axes = np.linalg.eigh(0.5 * scale[:, None] * (information + information.T) * scale)
         kept = sizes > LEAST * sizes[-1]
         along = axes[:, kept].T @ (scale * known)
         fall, amplitudes = float(np.sum(along**2 / sizes[kept])), scale * (axes[:, kept] @ (along / sizes[kept]))
-        if not structure.acts_on:  # the same on every sky: more scatter than that is none of the filter's model
+        if (
+            fall > 0.0 and not structure.acts_on
+        ):  # the same on every sky: more scatter than that is none of the filter's model
             scatter = float(np.var(rows @ (amplitudes @ coordinates), ddof=1))
             fall *= min(1.0, fall / scatter * (1.0 + 4.0 * np.sqrt(2.0 / len(rows))))
         return fall, amplitudes

@@ -100,6 +100,8 @@ def test_structures_are_judged_by_what_they_make_on_this_sky():
         _, found, amplitudes = search.judged([0, 1], x, responses)
         np.testing.assert_allclose(np.concatenate(amplitudes), 1.0 / factor, rtol=0.02)
         np.testing.assert_allclose(found, expected * np.array(falls), rtol=0.02)
+        _, (nothing, _), (none, _) = search.judged([0, 1], x, [(responses[0][0], -responses[0][1]), responses[1]])
+        assert (nothing, *none) == (0.0, 0.0)  # a response that is against the scores measures nothing
         _, average, _ = replace(search, exact=False).judged([0, 1], x, responses)
         np.testing.assert_allclose(average, expected, rtol=0.02)
 
