@@ -276,9 +276,8 @@ class Search:
         kept = sizes > LEAST * sizes[-1]
         along = axes[:, kept].T @ (scale * known)
         fall, amplitudes = float(np.sum(along**2 / sizes[kept])), scale * (axes[:, kept] @ (along / sizes[kept]))
-        if (
-            fall > 0.0 and not structure.acts_on
-        ):  # the same on every sky: more scatter than that is none of the filter's model
+        if fall > 0.0 and not structure.acts_on:
+            # It is the same on every sky: more scatter than that is not of the filter's model.
             scatter = float(np.var(rows @ (amplitudes @ coordinates), ddof=1))
             fall *= min(1.0, fall / scatter * (1.0 + 4.0 * np.sqrt(2.0 / len(rows))))
         return fall, amplitudes
