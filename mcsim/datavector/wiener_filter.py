@@ -5,7 +5,8 @@ With d_i the maps, P_i the fiducial response of map i (beam, pixel window, centr
     s^ = (S^-1 + sum_i P_i^t N_i^-1 P_i)^-1 sum_i P_i^t N_i^-1 d_i,     r_i = N_i^-1 (d_i - P_i s^).
 
 On the full sky the first inverse is taken as if noise were isotropic, which costs little. Behind a mask it would cost
-much, and is that of the noise of every pixel, by conjugate gradients (Model.inverse).
+much, and is that of the noise of every pixel, by conjugate gradients (Model.inverse). What describes unlisted effects
+has it on every sky, with the offsets of the samples (Model.exact).
 
 The matched filter of any small change dP_i of a response is <r_i, dP_i s^>: the filtered sky of *all* maps stands in
 for the sky, so that noise limits it, not cosmic variance as for the spectra of a single sky. A change of the beam,
@@ -42,7 +43,6 @@ FAINT = 0.1
 SHARP = 30.0
 """Power of the sky over that of the noise at the last degree, up to which conjugate gradients converge soon: the
 preconditioner has no such sharp end (:class:`mcsim.simulation.preconditioner.Preconditioner`)."""
-
 
 EXACT = 0.1  #: filter_tolerance of the exact filter
 
