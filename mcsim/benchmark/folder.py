@@ -115,9 +115,12 @@ def read_key(folder: Path, case: str) -> Truth:
         del plain["schema"]
         for member in plain["members"]:
             member |= {"coordinates": tuple(member["coordinates"]), "response": tuple(member["response"])}
+            # JSON knows no tuples, and an effect takes no lists.
+            parameters = member["parameters"].items()
+            member["parameters"] = {name: tuple(one) if isinstance(one, list) else one for name, one in parameters}
         members = tuple(Member(**member) for member in plain.pop("members"))
         return Truth(members=members, without=tuple(plain.pop("without")), **plain)
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path} cannot be read as a key ({error}); {NO_KEY}.") from error
 
 

@@ -3,6 +3,7 @@
 import tomllib
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import tomli_w
 from hypothesis import given
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from mcsim import config
 from mcsim.benchmark import challenge
 from mcsim.benchmark.case import Member, Truth
-from mcsim.benchmark.challenge import _without_none, make, make_case, run
+from mcsim.benchmark.challenge import _without_none, make, make_case, maps_of, run
 from mcsim.benchmark.folder import (
     MAPS,
     SEAL,
@@ -53,15 +54,16 @@ def seal(folder, text):
     (folder / MAPS / "case-000" / SEAL).write_text(f"{text}  keys/case-000.json\n")
 
 
+numbers = st.lists(st.floats(allow_nan=False)).map(tuple)
 effects = st.builds(
     Member,
     st.text(),
     st.none() | st.text(),
-    st.dictionaries(st.text(), st.floats(allow_nan=False) | st.booleans() | st.text()),
-    st.lists(st.floats(allow_nan=False)).map(tuple),
+    st.dictionaries(st.text(), st.floats(allow_nan=False) | st.booleans() | st.text() | numbers),
+    numbers,
     st.floats(0, 100),
     st.none() | st.integers(0, 99),
-    st.lists(st.floats(allow_nan=False)).map(tuple),
+    numbers,
 )
 
 
@@ -72,6 +74,15 @@ def test_a_key_is_read_as_it_was_written(tmp_path_factory, members, without, see
     write_key(folder, written)
     seal(folder, key_hash(folder, "case-000"))
     assert read_key(folder, "case-000") == open_key(folder, "case-000") == written
+
+
+def test_a_key_that_was_read_makes_maps_of_a_spectrum_with_bands(tmp_path):
+    small = config.load("quickstart", ["sky.lmax=24", "biposh.lmax=16", "map.nside=8"])
+    bands = (1.0, 0.5, 0.0, 0.0, 0.0, 0.0)
+    member = Member("spectrum", None, {"amplitude": 0.1, "bands": bands}, bands, 6.0, 0)
+    known = write_key(tmp_path, truth(members=(member,), sampled=False))
+    changed, plain = (dict(maps_of(small, one)) for one in (known, truth(members=(), sampled=False)))
+    assert all(np.std(changed[name] - plain[name]) > 1.0 for name in plain)
 
 
 def test_effects_on_request_are_settings_of_a_challenge(tmp_path):
