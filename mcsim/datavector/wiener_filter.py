@@ -6,7 +6,8 @@ With d_i the maps, P_i the fiducial response of map i (beam, pixel window, centr
 
 On the full sky the first inverse is taken as if noise were isotropic, which costs little. Behind a mask it would cost
 much, and is that of the noise of every pixel, by conjugate gradients (Model.inverse). What describes unlisted effects
-has it on every sky, with the offsets of the samples (Model.exact).
+has it on every sky, with the offsets of the samples (Model.exact). Of maps that show the sky beyond the filter's last
+degree it has that of their mean, and takes what all of them have alike in a pixel for sky (Model._of_mean).
 
 The matched filter of any small change dP_i of a response is <r_i, dP_i s^>: the filtered sky of *all* maps stands in
 for the sky, so that noise limits it, not cosmic variance as for the spectra of a single sky. A change of the beam,
@@ -29,7 +30,7 @@ from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
 from mcsim.simulation.noise import NoiseOfFiles
-from mcsim.simulation.survey import Channel, Survey
+from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
@@ -46,6 +47,9 @@ preconditioner has no such sharp end (:class:`mcsim.simulation.preconditioner.Pr
 
 EXACT = 0.1  #: filter_tolerance of the exact filter
 
+LEFT = 0.01  #: share of what was subtracted from maps that stays in :meth:`Part.without_response`
+RANK = 1e-10  #: smallest eigenvalue over the largest of templates that are fitted and subtracted
+
 
 @dataclass(frozen=True)
 class Part:
@@ -57,6 +61,29 @@ class Part:
     moments: Moments  # of the orientations of its samples
     precision: Map  # inverse variance of the noise of every pixel, uK^-2, (npix,); 0 where unobserved or masked
     noise_power: float  # of the noise in the map's a_lm when its pixels count alike, uK^2 sr
+    #: what its preparation fits and subtracts, shape (K, npix), and with which weights, if that counts
+    subtracted: tuple[tuple[NDArray[np.float64], Map], ...] = ()
+
+    def without_subtracted(self, map_uk: Map) -> Map:
+        """Return a map from which all is subtracted once more: observed ones may have some of it, simulated none."""
+        for columns, used, normal in self._weighted:
+            map_uk = map_uk - np.linalg.lstsq(normal, used @ map_uk, rcond=RANK)[0] @ columns
+        return map_uk
+
+    def without_response(self, residual: Map) -> Map:
+        """Return a residual whose products with signals are those with what the preparation leaves of these, uK^-1.
+
+        But for a share LEFT: scores of what is subtracted are small, and not mere rounding.
+        """
+        for columns, used, normal in reversed(self._weighted):
+            residual = residual - (1.0 - LEFT) * np.linalg.lstsq(normal, columns @ residual, rcond=RANK)[0] @ used
+        return residual
+
+    @property
+    def _weighted(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:
+        """Return columns, columns with weights, and their normal matrix."""
+        used = [np.where(self.moments.hits > 0, weight, 0.0) * columns for columns, weight in self.subtracted]
+        return [(columns, own, own @ columns.T) for (columns, _), own in zip(self.subtracted, used, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -74,8 +101,13 @@ class Model:
     #: beyond lmax: the isotropic filter
     inverse: InverseCovariance | None
     white: bool  # the noise of pixels is independent, and the maps do not show the sky beyond lmax
+    #: amplitude in every channel of the sky beyond lmax, sqrt(C_l) B_l w_l, uK, (channel, sky.lmax + 1); 0 if maps do
+    #: not show it or their noise is not white
+    unresolved: NDArray[np.float64]
     sky_power: Cl  # of s^: E|s^_lm|^2 / C_l = C_l / (C_l + N_l) in the isotropic approximation
     settings: DiagnosisSettings
+    #: s^ is that of the mean of all maps, and what they have alike beside it is sky beyond lmax, of this variance, uK^2
+    pooled: float = 0.0
 
     @property
     def frame(self) -> str:
@@ -101,14 +133,49 @@ class Model:
 
     @cached_property
     def exact(self) -> "Model":
-        """Return the model with the inverse covariance of all maps, samples' offsets included, if noise is white.
+        """Return the model with the inverse covariance of all maps, samples' offsets included, if it is known.
 
-        Its filter goes on until what all maps have alike, which is nearly all sky, is known to a tenth of its residual.
+        It is if noise is white, and of maps that show the sky beyond lmax (:meth:`_of_mean`). Its filter goes on until
+        what all maps have alike, which is nearly all sky, is known to a tenth of its residual.
         """
-        if not self.white:
+        if self.pooled or not self.has_exact:
             return self
+        if not self.white:
+            return self._of_mean()
         inverse = _inverse(self.cl, self.response, self.parts, offsets=True)
         return replace(self, inverse=inverse, settings=replace(self.settings, filter_tolerance=EXACT))
+
+    @property
+    def has_exact(self) -> bool:
+        """Return True if scores of :attr:`exact` have the variance of their response."""
+        return self.white or bool(self.unresolved.any())
+
+    def _of_mean(self) -> "Model":
+        """Return the model with the inverse covariance of the mean of all maps, which show the sky beyond lmax.
+
+        In the mean this sky is noise, independent from pixel to pixel. What a beam makes of it otherwise than the
+        others is noise of its own maps.
+        """
+        weights = [1.0 / part.noise_power for part in self.parts]
+        response, shared = (
+            np.average([rows[part.channel] for part in self.parts], axis=0, weights=weights)
+            for rows in (self.response, self.unresolved)
+        )
+        own, alike = [_variance(one - shared) for one in self.unresolved], _variance(shared)
+        parts, known = list[Part](), list[tuple[NDArray[np.float64], Map]]()
+        for part, m in zip(self.parts, (m for channel in self.survey.channels for m in channel.maps), strict=True):
+            subtracted = []
+            for one in () if m.preparation is None else m.preparation.regressions():  # kept once
+                same = (other for other in known if all(map(np.array_equal, one, other)))
+                subtracted.append(next(same, one))
+                known.append(subtracted[-1])
+            precision = part.precision / (1.0 + own[part.channel] * part.precision)
+            parts.append(replace(part, precision=precision, subtracted=tuple(subtracted)))
+        total = np.sum([part.precision for part in parts], axis=0)
+        mean = replace(parts[0], channel=0, precision=total / (1.0 + alike * total))
+        settings = replace(self.settings, filter_tolerance=EXACT)
+        inverse = _inverse(self.cl, response[None], [mean])
+        return replace(self, parts=tuple(parts), inverse=inverse, settings=settings, pooled=alike)
 
     def of(self, channel: int) -> tuple[int, ...]:
         """Return the indices of the channel's maps."""
@@ -162,12 +229,18 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     lmax = _highest_degree(survey, snr)
     hidden = max(float(np.mean(part.precision == 0.0)) for part in parts)
     known = not survey.config.preparation and bool(np.all(snr[lmax + 1 :] <= 1.0) and snr[lmax] <= SHARP)
-    white = known and all(m.drawn is None and m.pairs is None for channel in survey.channels for m in channel.maps)
+    white = all(_has_white_noise(m) for channel in survey.channels for m in channel.maps)
+    beyond = (np.arange(snr.size) > lmax) * (white and np.any(snr[lmax + 1 :] > 1.0))
+    unresolved = beyond * np.sqrt(survey.cl) * response
     cl, response, snr = survey.cl[: lmax + 1], response[:, : lmax + 1], snr[: lmax + 1]
     dipole = dipole_alm(survey.channels[0].site.dipole_uk, lmax)
     inverse = _inverse(cl, response, parts) if known and hidden >= settings.hidden_share else None
-    power = snr / (1.0 + snr)
-    return Model(survey, lmax, survey.nside, cl, response, tuple(parts), dipole, inverse, white, power, settings)
+    maps = survey.nside, cl, response, tuple(parts), dipole
+    return Model(survey, lmax, *maps, inverse, known and white, unresolved, snr / (1.0 + snr), settings)
+
+
+def _has_white_noise(m: SurveyMap) -> bool:
+    return m.drawn is None and m.pairs is None and (m.preparation is None or not m.preparation.transforms)
 
 
 def _inverse(cl: Cl, response: NDArray[np.float64], parts: Sequence[Part], offsets: bool = False) -> InverseCovariance:
@@ -210,7 +283,12 @@ def _circular(channel: Channel, made: Channel) -> Cl:
 
 def sky_variance(cl: Cl, response: Cl) -> float:
     """Return the variance over the sky of a spectrum seen through B_l, in its unit."""
-    return float(np.sum((2 * np.arange(cl.size) + 1) / (4 * np.pi) * cl * response**2))
+    return _variance(np.sqrt(cl) * response)
+
+
+def _variance(root: Cl) -> float:
+    """Return the variance over the sky of a signal, given the root of its spectrum."""
+    return float(np.sum((2 * np.arange(root.size) + 1) / (4 * np.pi) * root**2))
 
 
 def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
@@ -219,21 +297,16 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
     clean, seen = _clean(model, maps)
     sky = _sky(model, clean)
     looked_at = sky + model.dipole
-    expected = np.empty((len(model.parts), seen[0].size))
+    expected = _expected(model, clean, sky)
     residual, adjoint = np.empty_like(expected), np.empty((len(model.parts), sky.size), dtype=np.complex128)
     orders = np.zeros((len(model.parts), top + 1, lmax + 1), dtype=np.complex128)
     k = np.sqrt(4 * np.pi / (2 * np.arange(lmax + 1) + 1))
-    made = convolve.CircularMaps(model.nside, lmax)
-    for channel, response in enumerate(model.response):
-        through = alm_.multiply(sky, response, lmax)
+    for channel in range(len(model.channels)):
         members = model.of(channel)
         window = model.survey.channels[channel].window[: lmax + 1]
         for i in members:
             part = model.parts[i]
-            expected[i] = made.map(through)
-            if part.moments.dtheta is not None:
-                expected[i] += convolve.centroid_map(made.gradient(through), part.moments)
-            residual[i] = np.where(seen[i], part.precision * (clean[i] - expected[i]), 0.0)
+            residual[i] = part.without_response(np.where(seen[i], part.precision * (clean[i] - expected[i]), 0.0))
             adjoint[i] = healpix.adjoint(residual[i], lmax)
             orders[i, 0] = window * k * by_degree(looked_at, adjoint[i], lmax)
         for i, s, together in _transforms(model, members):
@@ -246,6 +319,34 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
     difference = np.stack([_normalised_difference(model, residual, alike) for alike in groups])
     squares = np.stack([_squares(model, residual, alike) for alike in groups])
     return FilteredMaps(sky, expected, residual, adjoint, orders, difference, squares)
+
+
+def _expected(model: Model, clean: Sequence[Map], sky: Alm) -> NDArray[np.float64]:
+    """Return what the maps show of a sky, uK, shape (map, npix); pooled maps what they have alike beside it, too.
+
+    Notes
+    -----
+    The unresolved sky u of a pixel is taken for the same in all maps, and for independent of other pixels. Given s^,
+    the mean of what is left of the maps with weights 1/N_i has the variance of u and 1/sum_i(1/N_i).
+    """
+    made = convolve.CircularMaps(model.nside, model.lmax)
+    expected = np.empty((len(model.parts), clean[0].size))
+    for channel, response in enumerate(model.response):
+        through = alm_.multiply(sky, response, model.lmax)
+        for i in model.of(channel):
+            expected[i] = made.map(through)
+            if model.parts[i].moments.dtheta is not None:
+                expected[i] += convolve.centroid_map(made.gradient(through), model.parts[i].moments)
+    if model.pooled:
+        left, precision = _summed(model, [map_ - own for map_, own in zip(clean, expected, strict=True)])
+        expected += model.pooled * left / (1.0 + model.pooled * precision)
+    return expected
+
+
+def _summed(model: Model, maps: Sequence[Map]) -> tuple[Map, Map]:
+    """Return the sum of maps over their noise variances, and of one over these, shape (npix,) both."""
+    precision = [part.precision for part in model.parts]
+    return np.sum([one * map_ for one, map_ in zip(precision, maps, strict=True)], axis=0), np.sum(precision, axis=0)
 
 
 def _normalised_difference(model: Model, residual: NDArray[np.float64], parts: tuple[int, ...]) -> Map:
@@ -314,13 +415,14 @@ def _clean(model: Model, maps: Sequence[Map]) -> tuple[list[Map], list[NDArray[n
             through = alm_.multiply(sky, model.response[model.parts[i].channel], model.lmax)
             smooth = healpix.synthesis(through[None], model.nside, model.lmax)[0]
             clean[i] = np.where(hole, smooth, clean[i])
-    return clean, seen
+    return [part.without_subtracted(map_) for part, map_ in zip(model.parts, clean, strict=True)], seen
 
 
 def _sky(model: Model, clean: Sequence[Map], careful: bool = False) -> Alm:
     lmax, settings = model.lmax, model.settings
     if model.inverse is not None:
-        weighted = model.inverse.adjoint(model.inverse.precision * np.stack(clean))
+        maps = divided(*_summed(model, clean))[None] if model.pooled else np.stack(clean)
+        weighted = model.inverse.adjoint(model.inverse.precision * maps)
         tolerance = settings.filter_tolerance * (0.01 if careful else 1.0)
         return model.inverse.approach(weighted, tolerance, settings.filter_iterations)
     total = np.zeros(alm_.size(lmax), dtype=np.complex128)

@@ -251,7 +251,7 @@ def scores_of_maps(model: Model, scene: Scene, maps: Sequence[Map]) -> Vector:
 
 
 def filtered(model: Model, maps: Sequence[Map]) -> FilteredMaps:
-    """Return filtered maps, by the noise of every pixel and the offsets of its samples, if their noise is white.
+    """Return filtered maps, by the noise of every pixel and the offsets of its samples, if that is known.
 
     Only then is the scatter of scores, by which structures are fitted, their response to what they measure.
     """
@@ -282,13 +282,13 @@ def scene_for(job: Job) -> Scene:
 @lru_cache(maxsize=1)
 def _scene(fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings, library: Kinds, content: str) -> Scene:
     job = Job(fiducial, fiducial, 0, 0, content=content, without=without, settings=settings, library=library)
-    return scene_of(analysis_for(job).model)
+    return scene_of(analysis_for(job).model.exact)
 
 
 def search_of(analysis: Analysis, scene: Scene, ask: Ask) -> Search:
     """Return the search of the maps of a model."""
     null, count = null_scores(analysis, ask), len(scene.keys)
-    return Search(structures(scene), null[:, :count], _charged(scene, null[:, count:]), analysis.model.white)
+    return Search(structures(scene), null[:, :count], _charged(scene, null[:, count:]), analysis.model.has_exact)
 
 
 def _charged(scene: Scene, falls: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -107,6 +107,16 @@ class Preparation:
             power = step.local(power) if correlated else step.noise(power)
         return np.sqrt(np.nan_to_num(self.noise_band(fine) * power))
 
+    def regressions(self) -> list[tuple[NDArray[np.float64], Map]]:
+        """Return what is fitted and subtracted, shape (K, npix), and with which weights, as prepared maps show it."""
+        found: list[tuple[NDArray[np.float64], Map]] = []
+        for step in self.steps:
+            if isinstance(step, Regression):
+                found += [(step.columns, step.weight)] if step.coefficients is None else []
+            else:
+                found = [(np.stack(list(map(step.apply, one))), step.local(weight)) for one, weight in found]
+        return [(np.nan_to_num(columns), np.nan_to_num(weight)) for columns, weight in found]
+
     def weight(self) -> Map | None:
         """Return the product of the masks of the steps in the prepared pixels; None without one."""
         weight: Map | None = None

@@ -10,7 +10,7 @@ from instruments import two_channels
 from mcsim import config
 from mcsim.config.noise import NoiseCorrelated
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import model_of, shared_sky, wiener_filter
+from mcsim.datavector.wiener_filter import LEFT, model_of, shared_sky, wiener_filter
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
@@ -108,3 +108,48 @@ def test_maps_that_keep_the_isotropic_filter(run):
     assert whole.inverse is not None
     quiet = tuple(replace(one, noise=replace(one.noise, sigma0_uk=1.0)) for one in run.channels)
     assert modelled(replace(run, channels=quiet)).inverse is None  # the sky is far above the noise at the last degree
+
+
+@pytest.fixture(scope="module")
+def bright(run):
+    """Maps degraded to pixels that show the sky far beyond the last degree of the filter, without dipole."""
+    steps = [{"kind": "degrade", "nside": 8}, {"kind": "subtract_dipole", "mask": run.map.mask}]
+    table = two_channels("bright", lmax=96, nside=32, fwhm_arcmin=80.0, sigma0_uk=60.0, period_s=61.0)
+    table["channel"][1]["beam"]["fwhm_arcmin"] = 40.0
+    table["map"] |= {"mask": run.map.mask, "mask_frame": "ecliptic"}
+    table["biposh"]["lmax"] = 16
+    for step in steps[1:]:
+        step["mask_frame"] = "ecliptic"
+    return modelled(config.load(table | {"preparation": steps}))
+
+
+@pytest.mark.parametrize("degree", [2, 4])
+def test_the_score_of_a_signal_in_bright_prepared_maps_has_the_variance_of_its_response(bright, degree):
+    """What all maps have alike beyond the filter's last degree is noise of their mean, and none of a difference."""
+    assert bright.has_exact
+    assert not bright.white
+    height = healpy.pix2vec(8, np.arange(12 * 8**2))[2]
+    legendre = np.polynomial.legendre.Legendre.basis(degree)(height)
+    prepared = bright.survey.maps[0].preparation
+    pattern = prepared.steps[1].apply(legendre)
+    exact, isotropic = excesses(bright, np.where(bright.parts[0].precision > 0.0, pattern, 0.0), bright.exact, bright)
+    assert abs(exact - 1.0) < 4.0 * np.sqrt(2.0 / 99)
+    assert isotropic > 4.0 * exact
+
+
+def test_the_score_of_a_signal_in_prepared_maps_is_that_of_what_the_preparation_leaves(bright):
+    signal = np.where(bright.parts[0].precision > 0.0, 1.0 + 2.0 * healpy.pix2vec(8, np.arange(12 * 8**2))[0] ** 3, 0.0)
+    left = bright.survey.maps[0].preparation.steps[1].apply(signal)
+    maps = list(simulate.maps(bright.survey, 2))
+    unaware = replace(bright.exact, parts=tuple(replace(part, subtracted=()) for part in bright.exact.parts))
+    both = zip(wiener_filter(bright.exact, maps).residual, wiener_filter(unaware, maps).residual, strict=True)
+    for residual, before in both:
+        assert residual @ signal == pytest.approx(before @ (left + LEFT * (signal - left)), rel=1e-9)
+
+
+def test_noise_with_memory_keeps_the_isotropic_filter_of_bright_maps(bright):
+    stripes = NoiseCorrelated(sigma0_uk=60.0, f_knee_hz=1e-3, f_min_hz=1e-5)
+    run = bright.survey.config
+    unknown = modelled(replace(run, channels=(replace(run.channels[0], noise=stripes), *run.channels[1:])))
+    assert not unknown.has_exact
+    assert unknown.exact is unknown

@@ -1,0 +1,67 @@
+"""What is missing in prepared maps, which show more of the sky than the filter, behind a mask."""
+
+import healpy
+import numpy as np
+import pytest
+
+from instruments import PROPOSED, ask, data_of, two_channels
+from mcsim import config, systematics
+from mcsim.datavector import campaign
+from mcsim.datavector.analysis import analysis_of
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.diagnosis import unlisted
+from mcsim.diagnosis.context import context
+from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.reconstruction import simulated_scores
+from mcsim.simulation import simulate
+from mcsim.sphere import real
+
+NSIDE = 8
+SKY = healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory):
+    """Two channels and a third, quiet one, degraded to nside 8, without monopole and dipole outside a mask."""
+    path = str(tmp_path_factory.mktemp("mask") / "mask.fits")
+    healpy.write_map(path, (np.abs(SKY[2]) > 0.3).astype(float), dtype=np.float64)
+    table = two_channels("prepared", lmax=96, nside=32, fwhm_arcmin=60.0, sigma0_uk=36.0, period_s=301.0)
+    quiet = {"name": "CMB", "frequency_ghz": 143.0, "noise": {"sigma0_uk": 5.0}}
+    table["channel"].append(table["channel"][0] | quiet)
+    table["map"] = {"nside": 32, "mask": path, "mask_frame": "ecliptic"}
+    table["biposh"]["lmax"] = 16
+    outside = {"kind": "subtract_dipole", "mask": path, "mask_frame": "ecliptic"}
+    run = config.load(table | {"preparation": [{"kind": "degrade", "nside": NSIDE}, outside]})
+    without = [name for name in systematics.catalogue() if name not in PROPOSED]
+    analysis = analysis_of(run, without=without, settings=DiagnosisSettings(beam_orders=2))
+    return context(analysis, *campaign.learned(analysis, ask, 220, time_ordered=False))
+
+
+def scored(jobs):
+    return [simulated_scores.scores(job) for job in jobs]
+
+
+def test_a_pattern_on_the_sky_of_prepared_maps_is_described(prepared):
+    """A pattern of ten times the noise of a pixel, which the isotropic filter did not tell from the sky."""
+    maps = list(simulate.maps(data_of(prepared.run), 1))
+    seen = np.abs(SKY[2]) > 0.3
+    quadrupole = real.field(np.array([0, 0, 0, 0, 0.3, -0.5, 2.0, 0.4, 0.6]), *SKY)
+    pattern = prepared.analysis.model.survey.maps[1].preparation.steps[1].apply(np.where(seen, quadrupole, np.nan))
+    pattern = 10.0 * pattern / np.nanstd(pattern)
+    maps[1] = np.where(seen, maps[1] + pattern, maps[1])
+    scene = simulated_scores.scene_for(prepared.analysis.job(prepared.run))
+    search = simulated_scores.search_of(prepared.analysis, scene, scored)
+    found, reduction = unlisted.structures_of(ObservedMaps(prepared, maps, ask), scene, search, scored)
+    (only,) = found
+    assert (only.stage, only.frame, only.channel) == ("added", "sky", "W1")
+    assert only.kind in ("quadrupole", "degrees 0-2")
+    assert abs(only.rms_uk / 10.0 - 1.0) < 4.0 * only.relative_error
+    assert reduction.achieved.value > 0.5
+
+
+def test_nothing_is_described_in_perfect_prepared_maps(prepared):
+    scene = simulated_scores.scene_for(prepared.analysis.job(prepared.run))
+    search = simulated_scores.search_of(prepared.analysis, scene, scored)
+    for realization in range(2, 6):
+        maps = list(simulate.maps(data_of(prepared.run), realization))
+        assert unlisted.structures_of(ObservedMaps(prepared, maps, ask), scene, search, scored) == ((), None)
