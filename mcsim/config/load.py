@@ -134,7 +134,11 @@ def from_json(text: str) -> RunConfig:
 
 def json_schema() -> dict[str, Any]:
     """Return the JSON schema of the TOML file, for editors."""
-    return _ADAPTER.json_schema(by_alias=True)
+    schema = _ADAPTER.json_schema(by_alias=True)
+    effect = schema["$defs"]["Effect"]
+    # In TOML the parameters of an effect stand beside its name, and each effect has its own.
+    effect["additionalProperties"] = effect["properties"].pop("parameters")["additionalProperties"]
+    return schema
 
 
 def _read(path: Path) -> tuple[dict[str, Any], Path]:

@@ -184,6 +184,15 @@ def test_json_schema_names_every_table(plain):
     assert schema["additionalProperties"] is False
 
 
+def test_json_schema_has_parameters_beside_the_name_of_an_effect():
+    """As in workflows/demo-truth.toml: an editor that validates a file must take what a run takes."""
+    effect = config.json_schema()["$defs"]["Effect"]
+    assert set(effect["properties"]) == {"name", "channel"}
+    kinds = [one["type"] for one in effect["additionalProperties"]["anyOf"]]
+    assert kinds == ["number", "string", "array"]
+    assert effect["additionalProperties"]["anyOf"][2]["items"] == {"type": "number"}
+
+
 def test_widths_that_may_be_in_radians_are_told(plain, folder):
     for width, warned in ((0.01, True), (1.0, False)):
         plain["channel"][1]["beam"]["fwhm_arcmin"] = width
