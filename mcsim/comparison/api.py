@@ -59,8 +59,9 @@ def compare(
         first is compared; configurations, of which realization 0 is simulated; or arrays, shape (npix,) each, by name
         ("channel" or "channel:split") or in the order of the model's maps.
     model
-        Run that describes side A: beams, scans, nside, lmax; by default side A or B if it is a configuration, or
-        ``model.toml`` in its folder; else ``model.toml`` beside side A.
+        Run that describes side A: beams, scans, nside, lmax; by default side A if it is a configuration, or
+        ``model.toml`` in its folder; else the same of side B, which then describes that; else ``model.toml`` beside
+        side A.
         Without one, only differences of the maps themselves are tried: units, calibration, monopole, dipole, order of
         the pixels, exchanged files.
     output
@@ -168,6 +169,7 @@ def _explained(
 
     Last comes the share of the variance that is left beyond what noise may hide.
     """
+    second = pair.turned != sides.of_b  # the model was taken for that of the other side first
     sky, _ = (_sky_rms(pair, side) for side in "AB")
     if _rms((pair.b - pair.a)[pair.seen]) <= ROUNDING * sky:
         return _result(pair, "identical"), None, 0.0
@@ -179,15 +181,15 @@ def _explained(
     sets = problem.best()
     if sides.run is not None and not (sets and problem.complete(sets[0])):
         # An effect of side A is one of side B with the other sign, and was found before sides are exchanged.
-        if not pair.turned:
+        if not second:
             problem = replace(problem, library=(*problem.library, *effects_of(pair, sides.run)))
         sets = problem.best(1)
-        there = problem.scene(sets[0].members) if sets and not pair.turned else None
+        there = problem.scene(sets[0].members) if sets and not second else None
         if there is not None and not problem.complete(sets[0]) and _correlation(pair, there) < SAME_SKY:
             seen_there = effects_of(replace(pair, scene=there), sides.run)
             problem = replace(problem, library=(*problem.library, *seen_there))
             sets = problem.best(1)
-    if pair.turned and not (sets and problem.suffices(sets[0])):
+    if second and not (sets and problem.suffices(sets[0])):
         return _result(pair, "unknown"), problem, 1.0
     if not sets or not problem.suffices(sets[0]) or problem.unexplained(sets[0]) > DOUBTFUL:
         sets = sorted([*sets, *problem.best(2)], key=lambda one: one.left)
@@ -312,5 +314,6 @@ def _sky_rms(pair: ChannelPair, side: str = "A") -> float:
         left.append(one[seen] - t @ np.linalg.lstsq(t, one[seen], rcond=None)[0])
     size = _rms(np.concatenate(left))
     if size <= PRECISION:
-        raise InputError(f"the maps of {pair.name} on side {side} are constant; give maps of a sky.")
+        label = "AB"["AB".index(side) ^ pair.turned]
+        raise InputError(f"the maps of {pair.name} on side {label} are constant; give maps of a sky.")
     return size

@@ -66,6 +66,9 @@ class EffectDifference(Difference):
             size = (self.amplitude(value) / highest) ** 2
         return value / max(1.0, float(np.sqrt(size)))
 
+    def inverse(self, value: Vector) -> Vector:
+        return -value if self.linear else -value / (1.0 + value)
+
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         return maps + np.tensordot(value, self._templates_in(state), 1)
 

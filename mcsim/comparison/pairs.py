@@ -117,11 +117,15 @@ class ChannelPair:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """All channels of two sides, and the run that describes side A, if one does."""
+    """All channels of two sides, and the run that describes one of them, if one does.
+
+    ``pairs`` have the side that the run describes for side A, exchanged if that is side B (``of_b``).
+    """
 
     pairs: tuple[ChannelPair, ...]
     run: config.RunConfig | None
     not_compared: tuple[NotCompared, ...] = ()  #: maps that one side, or the model, lacks
+    of_b: bool = False  #: True if the run is side B's own, and so describes that
 
     @property
     def frame(self) -> str:
@@ -132,7 +136,7 @@ class Comparison:
 def read(
     a: str | Path, b: str | Path, model: str | Path | config.RunConfig | None = None, nthreads: int = 1
 ) -> Comparison:
-    """Read two sides: folders of FITS maps or configurations, with the run that describes side A.
+    """Read two sides: folders of FITS maps or configurations, with the run that describes side A, or is side B's own.
 
     Raises
     ------
@@ -141,7 +145,7 @@ def read(
     """
     for side in (a, b):
         _check_kind(side)
-    run, described = _model(a, b, model)
+    run, described, of_b = _model(a, b, model)
     whole: Survey | None = None
     orders: dict[str, int] = {}
     if run is not None:
@@ -162,8 +166,9 @@ def read(
         )
     found = (_pair(name, maps, sides, whole, nthreads) for name, maps in groups.items())
     pairs = (replace(pair, orders=orders.get(pair.name)) for pair in found)
-    noisy = tuple(pair if run is None else _with_noise(pair, run) for pair in pairs)
-    return Comparison(noisy, run, not_compared((a, b), sides, run))
+    noisy = (pair if run is None else _with_noise(pair, run) for pair in pairs)
+    own_first = tuple(pair.exchanged() if of_b else pair for pair in noisy)
+    return Comparison(own_first, run, not_compared((a, b), sides, run), of_b)
 
 
 def _check_kind(side: str | Path) -> None:
@@ -212,21 +217,21 @@ def _in_order(side: Given, names: Sequence[str]) -> Sequence[NDArray[np.float64]
 
 def _model(
     a: str | Path, b: str | Path, model: str | Path | config.RunConfig | None
-) -> tuple[config.RunConfig | None, str]:
-    """Return the run that describes side A, if one does, and its name in messages."""
+) -> tuple[config.RunConfig | None, str, bool]:
+    """Return the run that describes a side, if one does, its name in messages, and True if it is side B's own."""
     if isinstance(model, config.RunConfig):
-        return model, model.name
+        return model, model.name, False
     found: str | Path | None = model
+    own = [Path(side) / "model.toml" if Path(side).is_dir() else side for side in (a, b)]
     if found is None:
-        own = [Path(side) / "model.toml" if Path(side).is_dir() else side for side in (a, b)]
         beside = Path(a).absolute().parent / "model.toml"
         found = next((one for one in (*own, beside) if one in (a, b) or Path(one).is_file()), None)
     if found is None:
-        return None, ""
+        return None, "", False
     run = config.load(found)
     if run.map.grid != "healpix":
         raise InputError(f'{run.name} has map.grid = "{run.map.grid}" and so no pixels; set map.grid = "healpix".')
-    return run, str(found)
+    return run, str(found), model is None and found == own[1] != own[0]
 
 
 def _side(

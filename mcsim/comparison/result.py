@@ -84,7 +84,8 @@ class ChannelResult:
     noise_rms_uk: float
     left_rms_uk: float
     looks: tuple[str, ...]  #: what is left looks like, in words, if nothing is named
-    unmade_rms_uk: float  #: of what the simulation of side A leaves of its maps, if the verdict is "unknown"; else 0
+    #: of what the simulation of the side that the model describes leaves of its maps, if the verdict is "unknown"; 0
+    unmade_rms_uk: float
     #: a, b, explained, seen: maps, uK, shape (split, npix), ``explained`` the part of b - a that the set makes
     a: Maps
     b: Maps
@@ -96,10 +97,16 @@ class ChannelResult:
     #: lacks
     differing: tuple[str, ...] = ()
     absent: tuple[str, ...] = ()
-    #: of what single samples change in side A, if that was made from orientation moments; it is taken off first
+    #: of what single samples change in the side that the model describes, if that was made from orientation moments; it
+    #: is taken off first
     spread_rms_uk: float = 0.0
     #: True if the model describes side B, and the differences were found in side A; they say B relative to A
     reversed: bool = False
+
+    @property
+    def described(self) -> str:
+        """Side that the model describes, in words."""
+        return "side B" if self.reversed else "side A"
 
     @property
     def accuracy(self) -> float:
@@ -120,7 +127,8 @@ class ChannelResult:
         """Say what was found in this channel."""
         more = f" {self.one_sided} pixels that one side alone observed are left out." if self.one_sided else ""
         if self.spread_rms_uk:
-            more += f" What single samples change in side A, {number(self.spread_rms_uk)} uK rms, is taken off first."
+            spread = number(self.spread_rms_uk)
+            more += f" What single samples change in {self.described}, {spread} uK rms, is taken off first."
         if self.partly:
             more += f" That is {', '.join(self.differing)}; the other maps are identical."
         return self._found() + more
@@ -135,7 +143,7 @@ class ChannelResult:
             hint = f"; nearest is {near}, which explains {part} %" if near and share >= 0.01 else ""
             if self.unmade_rms_uk > 0.2 * self.rms_uk:
                 hint += (
-                    f". The model makes side A itself to {number(self.unmade_rms_uk)} uK rms only: "
+                    f". The model makes {self.described} itself to {number(self.unmade_rms_uk)} uK rms only: "
                     "check it, or give it the sky (sky.alm), which maps with noise or many holes do not show"
                 )
             if np.isnan(self.noncircular_rms_uk):

@@ -328,6 +328,10 @@ class Smoothing(Difference):
         factor = np.exp(-0.5 * ell * (ell + 1) * max(value[0], -1.0) * _variance(scene))
         return replace(scene, sky=alm_.multiply(scene.sky, factor, scene.lmax))
 
+    def inverse(self, value: Vector) -> Vector:
+        """Return the variance over that of the other side's beam."""
+        return -value / (1.0 + value)
+
     def amplitude(self, value: Vector) -> float:
         return float(np.sqrt(max(1.0 + value[0], 0.0)) - 1.0)
 

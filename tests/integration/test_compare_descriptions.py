@@ -207,6 +207,32 @@ def test_a_configuration_that_is_a_side_describes_it_whatever_lies_beside(tmp_pa
     assert mcsim.compare(folder, a).verdict == "identical"
 
 
+@pytest.mark.parametrize("described", ["model.toml", "folder"])
+@pytest.mark.parametrize(
+    ("beams", "name", "amplitude"),
+    [
+        (("fwhm_major_arcmin = 420.0", "fwhm_major_arcmin = 320.0"), "beam_width", 320.0 / 420.0 - 1.0),
+        (("angle_deg = 20.0", "angle_deg = 40.0"), "psi_offset", 20.0),
+    ],
+)
+def test_what_is_side_b_s_own_describes_that(tmp_path, described, beams, name, amplitude):
+    """The sky of side A is not that which its maps show through the beam of side B."""
+    text = DESCRIPTION.replace("320.0", "420.0") if name == "beam_width" else DESCRIPTION
+    there = text.replace(*beams).replace("fwhm_minor_arcmin = 420.0", "fwhm_minor_arcmin = 320.0")
+    (tmp_path / "a.toml").write_text(text)
+    (tmp_path / "model.toml").write_text(there)
+    side = tmp_path / "model.toml"
+    mcsim.write_maps(tmp_path / "a.toml", tmp_path / "a", realizations=0)
+    if described == "folder":
+        [side] = mcsim.write_maps(side, tmp_path / "b", realizations=0)
+        (tmp_path / "model.toml").rename(tmp_path / "b" / "model.toml")
+    found = mcsim.compare(tmp_path / "a", side)
+    assert names(found) == [name]
+    assert found.channels[0].differences[0].amplitude == pytest.approx(amplitude, rel=1e-3)
+    assert found.to_dict()["model_describes"] == {"W1": "b"}
+    assert found.channels[0].left < 1e-6
+
+
 @pytest.mark.parametrize("factor", [1.0, 1e-6])
 def test_a_configuration_beside_maps_of_a_run_has_the_orders_of_a_run(tmp_path, factor):
     """Whatever else is different, which may be far more than the orders that a run leaves out."""
@@ -225,6 +251,18 @@ def test_a_configuration_beside_maps_of_a_run_has_the_orders_of_a_run(tmp_path, 
         turned = next(d for d in found.channels[0].differences if d.name == "psi_offset")
         assert turned.amplitude == pytest.approx(5.0 * sign, rel=1e-3)
         assert found.channels[0].left < 1e-6
+
+
+def test_a_gain_beside_a_dipole_is_a_factor_from_either_side(tmp_path):
+    effect = '[[effect]]\nname = "calibration"\nchannel = "W1"\namplitude = 0.05\n'
+    for name, more in (("plain", ""), ("gain", effect)):
+        (tmp_path / f"{name}.toml").write_text(DESCRIPTION.replace("lmax = 32", "lmax = 32\ndipole_uk = 3364.5") + more)
+    plain, gain = tmp_path / "plain.toml", tmp_path / "gain.toml"
+    [folder] = mcsim.write_maps(gain, tmp_path / "maps", realizations=0)
+    for sides, amplitude in (((plain, folder), 0.05), ((folder, plain), 1.0 / 1.05 - 1.0)):
+        found = mcsim.compare(*sides)
+        assert names(found) == ["calibration"]
+        assert found.channels[0].differences[0].amplitude == pytest.approx(amplitude, rel=1e-4)
 
 
 def test_another_spectrum_is_no_cause_where_no_sample_can_be_elsewhere(tmp_path):
