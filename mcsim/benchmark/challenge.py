@@ -58,9 +58,10 @@ def make(
     writable(target)
     names = [f"case-{number:03d}" for number in range(cases)]
     files.check_keys(target, names)
-    settings.write(target, seed)
+    settings.check(target, seed)
     missing = [number for number, case in enumerate(names) if not files.is_finished(target, case)]
     if not missing:
+        settings.write(target, seed)
         return target
     with workers_of(settings, workers, quiet) as call:
         sampler = CaseSampler(settings.prior, learned_model(settings))
@@ -68,6 +69,7 @@ def make(
         if file is not None and any(kinds[number] == "invented" for number in missing):
             sampler = replace(sampler, out_of_library=responses(settings.model, file, call))
         drawn = [_truth(sampler.draw(kinds, seed, number), seed, number, settings.sampled_share) for number in missing]
+        settings.write(target, seed)  # now that nothing is left to refuse
         _each_case(call, make_case, [(settings, target, truth) for truth in drawn], quiet)
     return target
 

@@ -47,6 +47,21 @@ class Settings:
 
     def write(self, folder: Path, seed: int) -> None:
         """Write the settings, and the seed among the keys; InputError, with what differs, if the folder has others."""
+        for path, text in self._files(folder, seed):
+            write_once(path, text)
+        self.check(folder, seed)
+
+    def check(self, folder: Path, seed: int) -> None:
+        """Raise InputError, with what differs, if the folder has other settings, or another seed."""
+        for path, text in self._files(folder, seed):
+            if path.exists() and (changes := _changes(read_json(path, "restore it, or use another folder"), text)):
+                raise InputError(
+                    f"{path} is of a challenge with other settings ({'; '.join(changes)}); use those again, or another "
+                    "folder."
+                )
+
+    def _files(self, folder: Path, seed: int) -> list[tuple[Path, str]]:
+        """Return the files of the settings and of the seed, with what they hold."""
         plain = {
             "schema": 1,
             "model": config.to_dict(self.model),
@@ -56,14 +71,8 @@ class Settings:
             "simulations": self.simulations,
         }
         plain |= {"including": list(self.including)} if self.including else {}
-        for path, content in ((folder / SETTINGS, plain), (folder / KEYS / SETTINGS, {"seed": seed})):
-            text = json.dumps(content, indent=1, sort_keys=True) + "\n"
-            write_once(path, text)
-            if changes := _changes(read_json(path, "restore it, or use another folder"), json.loads(text)):
-                raise InputError(
-                    f"{path} is of a challenge with other settings ({'; '.join(changes)}); use those again, or another "
-                    "folder."
-                )
+        both = ((folder / SETTINGS, plain), (folder / KEYS / SETTINGS, {"seed": seed}))
+        return [(path, json.dumps(content, indent=1, sort_keys=True) + "\n") for path, content in both]
 
     @classmethod
     def read(cls, folder: Path) -> "Settings":
@@ -77,8 +86,9 @@ class Settings:
             raise InputError(f"{folder / SETTINGS} lacks what a challenge needs ({error}); make it again.") from error
 
 
-def _changes(old: Any, new: dict[str, Any]) -> list[str]:
+def _changes(old: Any, text: str) -> list[str]:
     """Return what differs in settings: not ``[compute]``, which changes no result; a seed, a secret, without values."""
+    new: dict[str, Any] = json.loads(text)
     if new.keys() == {"seed"}:
         return [] if old == new else ["seed"]
     kept = [dict(one) if isinstance(one, dict) else {} for one in (old, new)]

@@ -76,6 +76,13 @@ def test_what_was_made_stays(challenge):
         made(folder, sampled_share=0.9)
 
 
+def test_what_is_refused_after_the_draws_leaves_no_folder(tmp_path):
+    """Settings that were left there would refuse the number that the sentence asks for."""
+    with refused("20 simulations"):
+        made(tmp_path / "made", simulations=20)
+    assert not (tmp_path / "made").exists()
+
+
 def test_a_lost_case_is_made_again_with_the_same_key(challenge, tmp_path):
     folder, _ = challenge
     case = folder / "cases" / "case-001"
