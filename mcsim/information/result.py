@@ -106,6 +106,14 @@ class Limits:
             f"Told apart: the right one of two chosen with {100 * s.separation:g} % probability."
         )
 
+    @property
+    def unknowns(self) -> str:
+        """Say what is marginalised; empty: nothing."""
+        known = [f"{name} ± {width:g}" for name, width in self.settings.nuisances.items()]
+        if self.settings.unknown_dipole_uk:
+            known.append(f"a monopole and dipole of {self.settings.unknown_dipole_uk:g} µK rms")
+        return f"Marginalised over {', '.join(known)}." if known else ""
+
     def lines(self) -> list[str]:
         """Return the table as text."""
         rows: list[tuple[str, ...]] = []
@@ -121,9 +129,8 @@ class Limits:
         table = ["  ".join(f"{cell:{side[i]}{widths[i]}}" for i, cell in enumerate(row)) for row in rows]
         worst = max((one.error for one in self.effects), default=0.0)
         error = f" Errors of sigma from random probes: at most {100 * worst:.2g} %." if worst else ""
-        known = [f"{name} ± {width:g}" for name, width in self.settings.nuisances.items()]
-        marginal = [f"Marginalised over {', '.join(known)}."] if known else []
-        return [*(line.rstrip() for line in table), self.conventions, f"{self.method}.{error}", *marginal]
+        said = [self.conventions, f"{self.method}.{error}", self.unknowns]
+        return [*(line.rstrip() for line in table), *filter(None, said)]
 
     def to_json(self) -> dict[str, Any]:
         """Return the table in the layout of ``limit.json``."""
@@ -138,6 +145,7 @@ class Limits:
             "conventions": self.conventions,
             "method": self.method,
             "nuisances": dict(s.nuisances),
+            "unknown_dipole_uk": s.unknown_dipole_uk,
             "effects": [self._effect_json(one) for one in self.effects],
         }
 
@@ -172,6 +180,7 @@ class Limits:
         names = texts(self.components)
         coordinates = {"effect": labels, "other": labels, "component": names, "component_": names}
         attributes = {"model": self.model, "conventions": self.conventions, "method": self.method, "tests": self.tests}
+        attributes["unknowns"] = self.unknowns
         return xr.Dataset(columns, coordinates, attributes)
 
     def save(self, folder: str | Path) -> None:

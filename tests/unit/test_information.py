@@ -380,6 +380,10 @@ def test_limits_are_written_and_say_what_they_are(tmp_path) -> None:
         np.testing.assert_array_equal(stored.fisher, found.fisher)
     assert (tmp_path / "out" / "limit.png").stat().st_size > 10_000
     assert any(line.startswith("noise_level (V1)") for line in found.lines())
+    unknown = replace(found, settings=replace(found.settings, nuisances={"beam_width": 0.01}, unknown_dipole_uk=10.0))
+    assert unknown.lines()[-1] == "Marginalised over beam_width ± 0.01, a monopole and dipole of 10 µK rms."
+    assert unknown.to_dataset().attrs["unknowns"] == unknown.lines()[-1]
+    assert (unknown.to_json()["unknown_dipole_uk"], written["unknown_dipole_uk"]) == (10.0, 0.0)
     assert "noise_level" not in describe(model(), mcsim.LimitSettings())
 
 
