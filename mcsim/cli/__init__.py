@@ -419,6 +419,8 @@ def config(
     """Check a configuration, or print the schema of all."""
     from mcsim import config as config_
 
+    if schema and name is not None:
+        raise InputError(f"--schema prints the schema of all configurations and checks none; leave it or {name} out.")
     if schema:
         print(json.dumps(config_.json_schema(), indent=2))
     elif name is not None:

@@ -66,6 +66,8 @@ def info(
     verify: Annotated[bool, Option("--verify", help="Read every file; exit code 1 if anything is damaged.")] = False,
 ) -> None:
     """Describe a store; export its summary; verify it."""
+    if verify and export is not None:
+        raise InputError(f"--verify writes nothing, so not {export} either; give --export in a command of its own.")
     if verify:
         from mcsim.ensemble import repair
 

@@ -36,6 +36,8 @@ from .conftest import SMALL, Command, assert_refused
         (("scan", "wmap", "-o", "x.foo"), ("x.foo", ".png")),
         (("info", "."), (" . ",)),
         (("info", ".", "--verify"), (" . ",)),
+        (("info", "nothing.zarr", "--verify", "--export", "x.nc"), ("--verify", "x.nc", "--export")),
+        (("config", "quickstart", "--schema"), ("--schema", "quickstart")),
         (("plot", "."), (" . ",)),
         (("plot", ".", "--predict", "nothing.zarr"), (" . ",)),
         (("plot", ".", "--exact"), ("--exact", "--predict")),
