@@ -49,7 +49,7 @@ class Verdict:
         lines = [f"{self.path} is damaged."]
         lines += [f"  {listed(damage.lost)}: {damage.reason}" for damage in self.damages if damage.lost]
         lines += [f"  {name}: {reason}" for name, reason in self.broken.items()]
-        repair = "computes them again" if self.lost else "repairs this"
+        repair = "computes the others again" if self.lost else "repairs this"
         lines.append(f"  {self.finished} of {self.size} realizations are whole; mcsim run --resume {repair}.")
         return "\n".join(lines)
 

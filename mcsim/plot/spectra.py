@@ -49,7 +49,9 @@ def ensemble_figure(
     modes = chosen.isel(mode=np.flatnonzero(keep))
     if modes.sizes["mode"] == 0:
         asked = ", ".join(f"{name} = {value}" for name, value in wanted.items())
-        raise InputError(f"{path} has no mode with {asked or 'finite values'}; mcsim info names what it holds.")
+        raise InputError(
+            f"{path} has no mode with {asked or 'finite values'} of the pair {label}; mcsim info names what it holds."
+        )
     expected = None if prediction is None else _matching(prediction, label, modes)
     return _draw(modes, f"{Path(path).name}: {label.replace(',', ' × ')}, {int(modes['count'])} realizations", expected)
 

@@ -81,7 +81,7 @@ def test_info_and_exports(mcsim: Command, small_store: Path, tmp_path: Path) -> 
 def test_plot_chooses_modes(mcsim: Command, small_store: Path, tmp_path: Path) -> None:
     assert mcsim("plot", small_store, "--L", 2, "--M", 0, "-o", "a20.png")[0] == 0
     assert (tmp_path / "a20.png").stat().st_size > 10_000
-    assert_refused(mcsim("plot", small_store, "--L", 9), "L = 9")
+    assert_refused(mcsim("plot", small_store, "--L", 9), "L = 9", "W1,W1")
 
 
 def test_effects_on_request_are_marked_and_proposed_when_asked_for(mcsim: Command, tmp_path: Path) -> None:
