@@ -39,9 +39,14 @@ class Settings:
     including: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Raise InputError for a share outside 0 to 1, or an effect that there is not."""
-        for name in self.including:
-            systematics.get(name)
+        """Raise InputError for a share outside 0 to 1, an effect that there is not, or one both in and out of it."""
+        proposed = {systematics.get(name).name for name in self.including}
+        own = set() if self.out_of_library is None else set(load(self.out_of_library))
+        if both := sorted(proposed & own):
+            raise InputError(
+                f"effect {both[0]} of {self.out_of_library} is proposed on request, and so not out of the library; "
+                "leave it out of --with, or out of the file."
+            )
         if not 0.0 <= self.sampled_share <= 1.0:
             raise InputError(f"a share of {self.sampled_share:g} made sample by sample is none; give 0 to 1.")
 

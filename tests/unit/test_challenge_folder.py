@@ -2,6 +2,7 @@
 
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -93,6 +94,14 @@ def test_effects_on_request_are_settings_of_a_challenge(tmp_path):
         Settings(config.load("quickstart")).write(tmp_path, 3)
     with refused("gain_spinn", "gain_spin"):
         replace(asked, including=("gain_spinn",))
+
+
+def test_an_effect_on_request_is_not_out_of_the_library():
+    """The right answer to it would be its name, and not that it is unknown."""
+    file = str(Path(__file__).parents[2] / "docs" / "howto" / "gain_step.py")
+    with refused("gain_step", file, "--with"):
+        Settings(config.load("quickstart"), out_of_library=file, including=(file,))
+    assert Settings(config.load("quickstart"), out_of_library=file).out_of_library == file
 
 
 def test_settings_are_read_as_they_were_written(folder):
