@@ -53,6 +53,9 @@ def make(
     target, file = Path(folder), settings.out_of_library
     if file is not None:
         settings = replace(settings, out_of_library=(file := str(Path(file).resolve())))
+    # Cases are diagnosed from wherever that is asked for.
+    including = (str(Path(name).resolve()) if name.endswith(".py") else name for name in settings.including)
+    settings = replace(settings, including=tuple(including))
     for channel in survey(settings.model).channels if settings.sampled_share > 0.0 or file else ():
         sampled.check(channel)
     writable(target)

@@ -76,6 +76,15 @@ def test_what_was_made_stays(challenge):
         made(folder, sampled_share=0.9)
 
 
+def test_a_file_with_an_effect_on_request_is_found_from_any_folder(tmp_path, monkeypatch):
+    file = Path(__file__).parents[2] / "docs" / "howto" / "gain_step.py"
+    monkeypatch.chdir(file.parent)
+    made(tmp_path / "made", 1, including=("gain_step.py",))
+    monkeypatch.chdir("/")
+    assert Settings.read(tmp_path / "made").including == (str(file),)
+    made(tmp_path / "made", 1, including=(str(file),))
+
+
 def test_what_is_refused_after_the_draws_leaves_no_folder(tmp_path):
     """Settings that were left there would refuse the number that the sentence asks for."""
     with refused("20 simulations"):
