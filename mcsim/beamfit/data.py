@@ -127,8 +127,8 @@ def project(
         exists = np.isfinite(inside)
         count = exists.sum(axis=-1)
         total = np.where(exists, inside, 0.0).sum(axis=-1)
-        mean = divided(total, count, np.nan)
-        columns.append(mean.imag if row.imaginary else mean.real)
+        mean = divided(total, count)
+        columns.append(np.where(count > 0, mean.imag if row.imaginary else mean.real, np.nan))
     return np.stack(columns, axis=-1)
 
 

@@ -65,6 +65,7 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
         )
     if len(set(rows)) < len(rows):
         raise InputError(f"{path} gives a bin of one mode twice; keep one row of each.")
+    _check_modes(path, selection, rows, label)
     value = np.concatenate(values)
     sigma = np.concatenate(sigmas) if errors else np.ones_like(value)
     bad = np.flatnonzero(~(np.isfinite(value) & np.isfinite(sigma) & (sigma > 0.0)))
@@ -76,6 +77,20 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
         )
     covariance, highest = np.diag(sigma**2), highest_of(path, table.meta)
     return Measurement(str(path), label, chosen, tuple(rows), scaling, value, covariance, None, highest=highest)
+
+
+def _check_modes(path: str | Path, selection: Selection, rows: list[Row], label: str | None) -> None:
+    """Raise InputError for a mode that is asked for and not there, or that repeats another one of a single map."""
+    found = {row.mode for row in rows}
+    absent = [mode for mode in selection.parsed if mode not in found]
+    if absent and selection.parsed != EVERYTHING.parsed:
+        raise InputError(f"{path} has no {absent[0].name} at these ell; leave the mode out.")
+    repeated = [mode for mode in selection.parsed if mode in found and not mode.in_auto]
+    if repeated and (label is None or len(set(label.split(","))) == 1):
+        raise InputError(
+            f"{path}: {repeated[0].name} of one map is zero, or repeats the mode with d = {-repeated[0].d}; leave the "
+            "mode out, or name the pair of different maps."
+        )
 
 
 def check_frame(path: str | Path, found: str, wanted: str) -> None:

@@ -179,6 +179,10 @@ def test_refusals(shared):
     with refused("W1, W2"):
         fit(data, two)
     assert fit(replace(data, pair="W2,W2"), two).solution.parameters == pytest.approx([0.7])
+    # A bin without a coefficient, of a mode that is imaginary.
+    odd = expected(shared, rescaled(shared, 0.7), ["L2M0d1"])
+    with refused("L2M0d1", "0-1"):
+        fit(replace(odd, rows=(odd.rows[0]._replace(ell_min=0, ell_max=1), *odd.rows[1:])), shared)
     # Circular beyond doubt: what is left has no template.
     blm = rescaled(shared, 0.0)
     flat = replace(shared, channels=(replace(shared.channels[0], beam=Beam(blm)),))

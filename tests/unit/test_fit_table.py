@@ -123,11 +123,19 @@ def test_parts_of_complex_modes_share_the_variance(tmp_path):
         (table(error=["0.1", "0.2", "0.3 uK2"]), {}, ("error", "'0.3 uK2'", "row 3", "number")),
         (table(unit="uK"), {}, ("value", "uK", "uK2")),
         (table(unit="uK_RJ2"), {}, ("value", "uK_RJ2", "uK2")),
+        (table(), {"modes": ["L2M0d0", "L4M0d0"]}, ("L4M0d0",)),
+        (table(d=[2, 2, -2]), {"modes": ["L2M0d2", "L2M0d-2"]}, ("L2M0d-2", "d", 2)),
+        (table(d=[2, 2, -2], pair=["a,a"] * 3), {"modes": ["L2M0d2", "L2M0d-2"]}, ("L2M0d-2", 2)),
     ],
 )
 def test_refusals(tmp_path, made, arguments, named):
     with refused(*named):
         read(tmp_path, made, **arguments)
+
+
+def test_both_orders_of_a_pair_of_maps_are_read(tmp_path):
+    found = read(tmp_path, table(d=[2, 2, -2], pair=["a,b"] * 3), modes=["L2M0d2", "L2M0d-2"])
+    assert [row.mode.d for row in found.rows] == [2, 2, -2]
 
 
 def test_a_file_that_is_no_table(tmp_path):
