@@ -38,9 +38,10 @@ def beam_figure(beam: Beam, beam_map: BeamMap | None = None, title: str = "") ->
     if title:
         figure.suptitle(title, fontsize=13, fontweight="bold")
     fwhm = summary.fwhm_major_arcmin if np.isfinite(summary.fwhm_major_arcmin) else np.degrees(0.5) * 60
-    _draw_peak(peak_axes, beam, beam_map, summary, 1.25 * fwhm)
+    off_centre = float(np.hypot(*summary.centroid_arcmin))
+    _draw_peak(peak_axes, beam, beam_map, summary, 1.25 * fwhm + off_centre)
     # To the outermost pixel with data inside the cut of a map.
-    reach = 5 * fwhm if beam_map is None else 1.05 * _ARCMIN * float(solid_angle_values(beam_map)[1].max())
+    reach = 5 * fwhm + off_centre if beam_map is None else 1.05 * _ARCMIN * float(solid_angle_values(beam_map)[1].max())
     _draw_faint(faint_axes, beam, beam_map, min(reach, 90 * 60))
     _draw_blm(blm_axes, beam)
     return figure

@@ -38,6 +38,22 @@ def test_ellipse_is_measured(known_as, major, minor, angle_deg) -> None:
     assert summary.negative_over_positive < 1e-6
 
 
+@pytest.mark.parametrize("known_as", ["map", "blm"])
+@pytest.mark.parametrize("offset_arcmin", [(9.0, -6.0), (-40.0, 30.0)])
+def test_ellipse_off_the_centre_has_the_same_axes(known_as, offset_arcmin) -> None:
+    # The second is farther from the centre than the width of the beam, where there is no half-power contour about it.
+    beam_map = drawn(30.0, 24.0, 20.0, offset=np.radians(np.array(offset_arcmin) / 60))
+    # Orders up to 48 hold all of a beam so far off the centre at these degrees.
+    beam = Beam.from_map(beam_map, 1500, 48)
+    summary = summarize(beam, beam_map if known_as == "map" else None)
+    assert summary.centroid_arcmin == pytest.approx(offset_arcmin, abs=0.01)
+    assert summary.fwhm_major_arcmin == pytest.approx(30.0, rel=1e-3)
+    assert summary.fwhm_minor_arcmin == pytest.approx(24.0, rel=1e-3)
+    assert summary.angle_deg == pytest.approx(20.0, abs=0.1)
+    sigma = np.radians(np.array([30.0, 24.0]) / 60) * SIGMA_PER_FWHM
+    assert summary.solid_angle_sr == pytest.approx(2 * np.pi * sigma.prod(), rel=1e-3)
+
+
 def test_circular_beam() -> None:
     summary = summarize(Beam.gaussian(30, 1500))
     assert summary.fwhm_circular_arcmin == pytest.approx(30, rel=1e-3)

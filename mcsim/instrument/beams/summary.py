@@ -25,9 +25,9 @@ class BeamSummary:
     source: str  #: ``"map"`` or ``"blm"``
     beam: Beam
     solid_angle_sr: float  #: integral of the response over its peak, steradian
-    fwhm_circular_arcmin: float  #: full width at half maximum of the mean over azimuth
-    #: fwhm_major_arcmin, fwhm_minor_arcmin, angle_deg: axes of the ellipse that fits the half-power contour about the
-    #: centre, and the direction of the major one, in degrees from the beam's x axis towards y, -90 to 90
+    fwhm_circular_arcmin: float  #: full width at half maximum of the mean over azimuth about the beam's centre
+    #: fwhm_major_arcmin, fwhm_minor_arcmin, angle_deg: axes of the ellipse that fits the half-power contour about its
+    #: own middle, and the direction of the major one, in degrees from the beam's x axis towards y, -90 to 90
     fwhm_major_arcmin: float
     fwhm_minor_arcmin: float
     angle_deg: float
@@ -63,9 +63,9 @@ def summarize(beam: Beam, beam_map: BeamMap | None = None, ells: tuple[int, ...]
 
     Notes
     -----
-    The half-power contour is where cubic interpolation first falls below half the peak, at 180 azimuths;
-    1/r^2 = a + b cos 2 phi + c sin 2 phi is fitted to it. Widths of elliptical Gaussians come back within 0.1 %
-    (tests/unit/test_beams_summary.py).
+    The half-power contour is where cubic interpolation first falls below half the peak, at 180 azimuths about the
+    middle of the area inside; 1/r^2 = a + b cos 2 phi + c sin 2 phi is fitted to it. Widths of elliptical Gaussians
+    come back within 0.1 %, also where they are off the centre (tests/unit/test_beams_summary.py).
     """
     # Half the width of a Gaussian of the same solid angle; sidelobes and elongation only make the search longer.
     response: _Response
@@ -73,13 +73,17 @@ def summarize(beam: Beam, beam_map: BeamMap | None = None, ells: tuple[int, ...]
         # Twice the rings and azimuths that the coefficients need: the negative part alone is not band-limited.
         rings = 2 * beam.lmax + 2
         weight = np.sin((np.arange(rings) + 0.5) * np.pi / rings)[:, None]
-        value, response = beam.on_rings(rings, 4 * beam.mmax + 4, "F1") * weight, beam.values
-        total, highest = 1.0, float(beam.values(np.zeros(1), np.zeros(1))[0])
+        on_rings, response = beam.on_rings(rings, 4 * beam.mmax + 4, "F1"), beam.values
+        value, total = on_rings * weight, 1.0
+        highest = max(float(on_rings.max()), float(beam.values(np.zeros(1), np.zeros(1))[0]))
+        ring, column = np.unravel_index(np.argmax(on_rings), on_rings.shape)
+        top = complex((ring + 0.5) * np.pi / rings * np.exp(2j * np.pi * column / on_rings.shape[1]))
     else:
-        value, response = solid_angle_values(beam_map)[0], beam_map.values
-        total, highest = float(value.sum()), float(beam_map.image.max())
+        (value, theta, phi), response = solid_angle_values(beam_map), beam_map.values
+        total, highest, largest = float(value.sum()), float(beam_map.image.max()), np.argmax(value)
+        top = complex(theta[largest] * np.exp(1j * phi[largest]))
     reach = min(8 * np.sqrt(total / highest * np.log(2) / np.pi), np.pi)
-    peak, circular, major, minor, angle_deg = _half_power(response, reach)
+    peak, circular, major, minor, angle_deg = _half_power(response, reach, top)
     # b_11 = -sqrt(3/8pi) <sin(theta) exp(-i phi)>
     offset = -np.sqrt(8 * np.pi / 3) * beam.blm[1, 1] if beam.mmax >= 1 else 0j
     return BeamSummary(
@@ -137,22 +141,35 @@ _LISTED_WINDOW = 1e-9  #: smallest B_l that is listed: ratios to smaller ones ar
 _Response = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 
-def _half_power(response: _Response, reach: float) -> tuple[float, float, float, float, float]:
-    """Return peak, half widths of circular part, major and minor axis (radians), and the major axis' angle (deg)."""
-    theta = np.linspace(0, reach, _RADII)
+def _half_power(response: _Response, reach: float, top: complex) -> tuple[float, float, float, float, float]:
+    """Return peak, half widths of circular part, major and minor axis (radians), and the major axis' angle (deg).
+
+    ``top``: where the response is nearly largest, theta e^{i phi}; the contour is sought within ``reach`` of it.
+    """
+    distance = np.linspace(0, reach, _RADII)
     phi = np.arange(_AZIMUTHS) * 2 * np.pi / _AZIMUTHS
-    grid_phi, grid_theta = np.meshgrid(phi, theta, indexing="ij")
-    values = response(grid_theta, grid_phi)
-    peak = values.max()
-    mean = values.mean(axis=0)
-    circular = _first_crossing(theta, mean[None], mean.max() / 2)[0]
-    radius = _first_crossing(theta, values, peak / 2)
+    points = distance * np.exp(1j * phi)[:, None]
+
+    def around(middle: complex) -> NDArray[np.float64]:
+        places = middle + points
+        return response(np.minimum(np.abs(places), np.pi), np.angle(places))
+
+    def contour(middle: complex) -> tuple[float, NDArray[np.float64]]:
+        values = around(middle)
+        return float(values.max()), _first_crossing(distance, values, values.max() / 2)
+
+    mean = around(0j).mean(axis=0)
+    circular = _first_crossing(distance, mean[None], mean.max() / 2)[0]
+    top += points.flat[np.argmax(around(top))]
+    _, radius = contour(top)
+    to_middle = 2 / 3 * np.sum(radius**3 * np.exp(1j * phi)) / np.sum(radius**2)
+    peak, radius = contour(top + np.nan_to_num(to_middle))
     level = np.mean(radius**-2)
     wave = 2 * np.mean(radius**-2 * np.exp(2j * phi))
     minor, major = 1 / np.sqrt(level + abs(wave)), 1 / np.sqrt(level - abs(wave))
     # 1/r^2 is least along the major axis.
     angle_deg = np.degrees(np.angle(-wave)) / 2
-    return float(peak), float(circular), float(major), float(minor), float(angle_deg)
+    return peak, float(circular), float(major), float(minor), float(angle_deg)
 
 
 def _first_crossing(theta: NDArray[np.float64], values: NDArray[np.float64], level: float) -> NDArray[np.float64]:
