@@ -299,6 +299,8 @@ def test_unusable_headers_are_refused(tmp_path) -> None:
     oblong = write(tmp_path / "oblong.fits", image, CDELT2=0.05)
     mirrored = write(tmp_path / "mirrored.fits", image, CDELT1=-0.04)
     radians = write(tmp_path / "radians.fits", image, CUNIT1="rad")
+    turned = write(tmp_path / "turned.fits", image, CROTA2=30.0)
+    matrix = write(tmp_path / "matrix.fits", image, PC1_2=-0.5, PC2_1=0.5)
     cube = write(tmp_path / "cube.fits", np.stack([image, image]))
     line = write(tmp_path / "line.fits", image[20])
     for path, named in [
@@ -306,6 +308,8 @@ def test_unusable_headers_are_refused(tmp_path) -> None:
         (oblong, ("oblong.fits", 0.04, 0.05)),
         (mirrored, ("mirrored.fits", -0.04, 0.04)),
         (radians, ("radians.fits", "CUNIT1", "rad")),
+        (turned, ("turned.fits", "CROTA2", 30.0, "pixel_deg")),
+        (matrix, ("matrix.fits", "PC1_2", -0.5, "pixel_deg")),
         (line, ("line.fits", 1)),
         (tmp_path / "absent.fits", ("absent.fits",)),
     ]:

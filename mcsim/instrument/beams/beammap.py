@@ -292,4 +292,10 @@ def _pixel_deg(header: fits.Header, path: str | Path) -> float:
             f"{path} has CDELT1 = {step_x:g} and CDELT2 = {step_y:g}, which must be equal and positive: "
             "resample or flip the image so that columns follow the beam's x, or give pixel_deg"
         )
+    for key in ("CROTA1", "CROTA2", "PC1_2", "PC2_1"):
+        if header.get(key):
+            raise InputError(
+                f"{path} has {key} = {header[key]}, but its columns must follow the beam's x: turn the image, or give "
+                "pixel_deg if they do"
+            )
     return step_x
