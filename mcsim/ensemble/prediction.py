@@ -170,17 +170,21 @@ def _dataset(survey: Survey, found: dict[tuple[int, int], Means]) -> xr.Dataset:
         "biposh_difference": np.stack([found[pair].beam - found[pair].circular for pair in survey.pairs]),
     }
     monopole = survey.estimator.modes.index(detectability.MONOPOLE)
-    each = [detectability.variances_of(survey, found, pair) for pair in survey.pairs]
-    variance, of_bins = (np.stack(arrays) for arrays in zip(*each, strict=True))
+    control = {pair: replace(one, beam=one.circular) for pair, one in found.items()}
+    variances = {}
+    for name, spectra in (("biposh", found), ("biposh_circular", control)):
+        each = [detectability.variances_of(survey, spectra, pair) for pair in survey.pairs]
+        variances[name] = tuple(np.stack(arrays) for arrays in zip(*each, strict=True))
+    # Its scatter is not that of an isotropic sky.
+    variances["biposh_difference"] = tuple(np.nan * array for array in variances["biposh"])
     scatter: dict[str, NDArray] = {}
     comoment: dict[str, NDArray] = {}
     degrees = 2.0 * np.arange(survey.lmax + 1) + 1.0
-    for name in list(mean):
-        known = np.nan if name.endswith("difference") else 1.0
-        scatter[name], scatter[f"{name}_binned"] = known * variance, known * of_bins
-        spectra = name.replace("biposh", "cl")
-        mean[spectra] = detectability.cl_of(survey, mean[name][:, monopole])
-        scatter[spectra] = scatter[name][:, monopole] / degrees
+    for name, (variance, of_bins) in variances.items():
+        scatter[name], scatter[f"{name}_binned"] = variance, of_bins
+        cl = name.replace("biposh", "cl")
+        mean[cl] = detectability.cl_of(survey, mean[name][:, monopole])
+        scatter[cl] = variance[:, monopole] / degrees
         mean[f"{name}_binned"] = summary.binned(layout, mean[name])
         if not name.endswith("difference"):
             comoment[f"{name}_binned"] = of_bins[..., None] * np.eye(of_bins.shape[-1])

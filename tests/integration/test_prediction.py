@@ -7,7 +7,7 @@ import pytest
 from distributed import Client
 from scipy import stats
 
-from mcsim import beamfit, config, open_ensemble, open_summary
+from mcsim import Beam, beamfit, config, open_ensemble, open_summary
 from mcsim.ensemble import prediction, runner, tables
 from mcsim.instrument import scan
 from refusals import refused
@@ -35,6 +35,21 @@ def test_layout_is_that_of_the_summary(small_store: Path) -> None:
         assert expected[name].attrs == variable.attrs
     difference = (summary - expected).biposh_difference_binned_mean
     assert difference.dims == ("pair", "mode", "bin")
+
+
+def test_errors_of_the_control_are_those_of_a_circular_beam() -> None:
+    beam = Beam.elliptical(300.0, 220.0, lmax=32)
+    one = {"name": "W1", "scan": {"kind": "parallel_transport"}, "noise": {"sigma0_uk": 20.0}}
+    whole, circular = (
+        prediction.predict(table(channel=[one | {"beam": each}]), exact=True) for each in (beam, beam.circular())
+    )
+    for spectra in ("biposh", "cl"):
+        found, wanted = whole[f"{spectra}_circular_standard_error"], circular[f"{spectra}_standard_error"]
+        np.testing.assert_allclose(found, wanted, rtol=1e-12)
+        # What the other orders of this beam add to its power.
+        assert (whole[f"{spectra}_standard_error"] / found).max() > 1.006
+    name = "biposh_{}binned_standard_error".format
+    np.testing.assert_allclose(whole[name("circular_")], circular[name("")], rtol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["parallel_transport", "moments"])
