@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import healpy
@@ -31,6 +32,15 @@ def test_parallel_transport_has_factors_of_one():
     assert factors.sky_mean == pytest.approx(1.0, abs=1e-14)
     # (2l+1)/2 int (d^l_22)^2 dcos(theta) = 1.
     np.testing.assert_allclose(factors.f_ell, 1.0, atol=1e-12)
+
+
+def test_what_was_not_observed_changes_no_factor_of_parallel_transport():
+    moments = Moments.parallel_transport(32)
+    x, _, z = healpy.pix2vec(32, np.arange(moments.npix))
+    seen = (z < 0.5) & (x < 0.3)  # a cap is missing, and part of every other ring
+    found = scan_factors(replace(moments, hits=seen.astype(float), w=np.where(seen, moments.w, 0.0)))
+    assert [found.quadrupole_ratio, found.sky_mean] == pytest.approx([1.0, 1.0], rel=1e-12)
+    np.testing.assert_allclose(found.f_ell, 1.0, rtol=1e-12)
 
 
 def test_factors_of_a_known_pattern():
