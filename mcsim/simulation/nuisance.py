@@ -13,7 +13,7 @@ from mcsim.config.messages import standing
 from mcsim.errors import InputError
 from mcsim.simulation import convolve
 from mcsim.simulation.channels import check_scope, site_of, table_of
-from mcsim.simulation.pixel_means import gain_of, signal_of
+from mcsim.simulation.pixel_means import gain_of, mean_gain, mean_signal, signal_of
 from mcsim.simulation.survey import Channel, Survey, survey, with_effects
 from mcsim.sphere import rng
 from mcsim.support.arrays import Map, Vector
@@ -227,26 +227,30 @@ class DisturbedSurvey:
             beam = seen_through(acting, site)
             beam = beam.truncated(min(beam.mmax, *(m.moments.smax for m in channel.maps)))
             response = convolve.response(beam, site.lmax, channel.window ** (spread_of(acting) ** 2))
+        bent = tuple(effect for one, effect in drawn if one.parameter_widths and one.channel in (None, channel.name))
         maps = []
         for place, m in enumerate(channel.maps):
-            means: dict[str, Map | None] = {"gain": m.gain, "signal_uk": m.signal_uk}
+            share = self.survey.config.map.span(place)
+            means = {"gain": [m.gain, mean_gain(bent, site, share)]}
+            means["signal_uk"] = [m.signal_uk, mean_signal(bent, site, share)]
             for (number, name, key), basis in self._means.items():
                 if name == channel.name:
                     effect = drawn[number][1]
-                    added, before = effect.parametrization.coordinates(effect) @ basis[place], means[key]
-                    means[key] = added if before is None else before + added
+                    means[key].append(effect.parametrization.coordinates(effect) @ basis[place])
             own = with_effects(m, more, site)
-            maps.append(replace(own, gain=means["gain"], signal_uk=means["signal_uk"]))
+            maps.append(replace(own, gain=_sum(means["gain"]), signal_uk=_sum(means["signal_uk"])))
         return replace(channel, beam=beam, response=response, maps=tuple(maps), effects=acting)
 
     @cached_property
     def _means(self) -> dict[tuple[int, str, str], list[Map]]:
         """Return the mean errors of the gain, and signals, per coordinate: linear in these, they take a pass each.
 
+        Those of a nuisance with further parameters that are drawn are not linear, and take a pass for every draw.
         By nuisance, channel, and name in a map: one array of shape (k, npix) for each map of the channel.
         """
         found = {}
-        for (number, one), channel in product(enumerate(self.nuisances), self.survey.making.channels):
+        linear = [(number, one) for number, one in enumerate(self.nuisances) if not one.parameter_widths]
+        for (number, one), channel in product(linear, self.survey.making.channels):
             for key, hook, mean in (("gain", "gain", gain_of), ("signal_uk", "signal", signal_of)):
                 if getattr(one.effect, hook) is getattr(Effect, hook) or one.channel not in (None, channel.name):
                     continue
@@ -257,3 +261,9 @@ class DisturbedSurvey:
                     for share in shares
                 ]
         return found
+
+
+def _sum(terms: Sequence[Map | None]) -> Map | None:
+    """Return the sum of maps, None for no map."""
+    maps = [term for term in terms if term is not None]
+    return sum(maps[1:], start=maps[0]) if maps else None

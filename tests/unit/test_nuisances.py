@@ -91,6 +91,18 @@ def test_a_disturbed_survey_is_that_of_a_run_with_the_effects_that_are_drawn(pre
         assert np.array_equal(simulate.realize(shared, realization)["cl"], simulate.realize(shared, realization)["cl"])
 
 
+def test_a_signal_follows_the_parameters_that_are_drawn_with_it():
+    lobe = {"effect": "sidelobe_pickup", "channel": "W1", "width": 0.001}
+    run = model(lobe | {"parameter_widths": {"angle_deg": 15.0, "galaxy_uk": 200.0}})
+    disturbed = DisturbedSurvey.of(run)
+    for realization in (0, 1):
+        drawn = tables(run, run.ensemble.seed, realization)
+        expected = survey(replace(run, effects=tuple(drawn))).channels[1].maps
+        for one, other in zip(disturbed.at(realization).channels[1].maps, expected, strict=True):
+            assert np.std(other.signal_uk) > 0.01
+            np.testing.assert_allclose(one.signal_uk, other.signal_uk, atol=1e-9)
+
+
 def test_a_calibration_multiplies_sky_and_dipole_in_all_pixels():
     run = model()
     off = replace(run, effects=(config.Effect(name="calibration", channel="W1", parameters={"amplitude": 0.01}),))
