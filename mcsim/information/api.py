@@ -259,6 +259,13 @@ def _candidates(
         for candidate in analysis.candidates
         if not settings.only or candidate.name in settings.only or _is_nuisance(candidate, settings)
     ]
+    for candidate in wanted:
+        fit = candidate.parametrization
+        if fit.stochastic and fit.mean_response and fit.sign >= 0:
+            raise InputError(
+                f"{candidate.name} changes the power of maps by fields that are drawn, and maps are not linear in its "
+                "amplitude: they have no derivative at 0, of which a limit could be made; leave it out."
+            )
     if all(_is_nuisance(candidate, settings) for candidate in wanted):
         raise InputError(
             f"no effect is left to compute a limit of (asked for: {', '.join(settings.only) or 'all'}): it is a "
