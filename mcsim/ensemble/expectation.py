@@ -21,7 +21,9 @@ from mcsim.bipolar.theory import (
     parallel_transport_harmonics,
 )
 from mcsim.bipolar.theory.harmonics import spin_functions
+from mcsim.config import preparation as declared
 from mcsim.errors import InputError
+from mcsim.simulation import convolve
 from mcsim.simulation import survey as survey_
 from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
@@ -39,6 +41,8 @@ L_WEIGHTS, SHARE = range(64, 193, 32), 0.99
 FOLDED = 0.1  #: of prepared noise at the highest l: what averages fold into it from beyond the degrees of their pixels
 EVEN, MOVED = 1e-6, 0.01
 """Variation of the power of noise that counts as none, and the share that a filter may move over the edge of a mask."""
+
+NEGLIGIBLE = 1e-3  #: dipole that is left in samples, over the rms of the sky, that a prediction may not have
 
 _LEFT_OUT = ("sky", "gain", "signal", "excess")  #: hooks of effects that no prediction follows
 
@@ -91,6 +95,31 @@ def _check_covered(channel: Channel) -> None:
                 f"effect {effect.name} on channel {channel.name} acts on the {changed[0]}, which predictions do not "
                 "cover; remove it, or simulate it with mcsim run."
             )
+
+
+def dipoles_left(survey: Survey) -> dict[str, float]:
+    """Return the dipole, uK, that effects on the beam leave in the samples of channels, where it is not negligible.
+
+    Effects on the beam change the dipole of the sky, of which the fiducial one is subtracted. It is negligible below
+    ``NEGLIGIBLE`` of the rms of the sky, or where the maps' own dipole is subtracted afterwards.
+    """
+    steps = survey.config.preparation
+    subtracted = [one for one in steps if isinstance(one, declared.SubtractDipole | declared.Templates) and one.dipole]
+    cl = spectrum(survey)
+    rms_uk = float(np.sqrt(np.sum((2.0 * np.arange(cl.size) + 1.0) * cl) / (4.0 * np.pi)))
+    found = {}
+    for channel in survey.channels:
+        window = channel.window ** (systematics.spread_of(channel.effects) ** 2)
+        fiducial = convolve.response(channel.site.beam, channel.site.lmax, window).factors[:2, 1]
+        change = np.zeros(2, dtype=np.complex128)
+        change[: channel.response.mmax + 1] += channel.response.factors[:2, 1]
+        change[: fiducial.size] -= fiducial
+        # Of the orders -1, 0 and 1 of the beam.
+        left_uk = float(np.linalg.norm(channel.site.dipole_uk) * np.linalg.norm([1.0, np.sqrt(2.0)] * change))
+        kept = not any(channel.name in (step.channels or (channel.name,)) for step in subtracted)
+        if channel.effects and kept and left_uk > NEGLIGIBLE * rms_uk:
+            found[channel.name] = left_uk
+    return found
 
 
 def _weighted(survey: Survey, m: SurveyMap) -> SurveyMap:

@@ -14,7 +14,16 @@ from mcsim import config
 from mcsim.bipolar import estimator
 from mcsim.bipolar.theory import ScannedBeam
 from mcsim.ensemble import detectability, plan, summary
-from mcsim.ensemble.expectation import Means, Source, held, means, moments_needed, scanned_beams, survey_of
+from mcsim.ensemble.expectation import (
+    Means,
+    Source,
+    dipoles_left,
+    held,
+    means,
+    moments_needed,
+    scanned_beams,
+    survey_of,
+)
 from mcsim.ensemble.tasks import packages, shared_survey
 from mcsim.simulation import power
 from mcsim.simulation.survey import Survey
@@ -219,6 +228,15 @@ def _attributes(survey: Survey, exact: bool, L_moments: int) -> dict[str, Any]:
     if run.map.grid == "healpix":
         window = "divided out of a_lm by the analysis, so it cancels but for the noise"
         left_out = "centroid offsets of the samples in a pixel, quadrature error of the analysis"
+    if dipoles := dipoles_left(survey):
+        left = ", ".join(f"{name}: {left_uk:.3g} uK" for name, left_uk in dipoles.items())
+        own = f"dipole that effects leave in samples ({left})"
+        left_out = own if left_out == "nothing" else f"{own}, {left_out}"
+        warnings.warn(
+            f"effects on the beam leave some of the dipole in samples ({left}), which predictions leave out: an "
+            "ensemble has more power at the lowest degrees; compare it with sky.dipole_uk = 0 in both.",
+            stacklevel=3,
+        )
     return {
         "name": run.name,
         "prediction": f"from b_lm of the beams, {order}",

@@ -347,6 +347,41 @@ def test_effects_are_predicted_or_refused(
         prediction.predict(changed)
 
 
+@pytest.mark.parametrize(
+    "effect",
+    [
+        {"name": "calibration", "channel": "W1", "amplitude": 0.01},
+        {"name": "pointing_offset", "channel": "W1", "amplitude": 60.0, "angle_deg": 90.0},
+    ],
+)
+def test_a_prediction_says_what_dipole_it_lacks(effect: dict[str, Any]) -> None:
+    """That of a map of no sky: the dipole, or its gradient along the parallels, a sine of the longitude."""
+    scan_ = {"kind": "parallel_transport"}
+    run = {
+        "name": "left",
+        "sky": {"spectrum": "wmap7", "lmax": 16, "dipole_uk": 3364.5},
+        "map": {"nside": 16},
+        "channel": [{"name": "W1", "beam": {"kind": "gaussian", "fwhm_arcmin": 500.0}, "scan": scan_}],
+        "effect": [effect],
+    }
+    shared = survey(config.load(run))
+    with pytest.warns(UserWarning, match="dipole_uk") as told:
+        expected = prediction.predict(shared)
+    (left_uk,) = expectation.dipoles_left(shared).values()
+    assert f"W1: {left_uk:.3g} uK" in str(told[0].message)
+    assert f"W1: {left_uk:.3g} uK" in expected.attrs["left_out"]
+    towards = shared.channels[0].site.dipole_uk / np.linalg.norm(shared.channels[0].site.dipole_uk)
+    share = 1.0 if effect["name"] == "calibration" else np.hypot(*towards[:2])
+    empty = np.zeros(17 * 18 // 2, dtype=np.complex128)
+    assert np.abs(simulate.maps(shared, 0, sky=empty)).max() == pytest.approx(left_uk * share, rel=0.01)
+    for quiet in (
+        {"effect": [{"name": "beam_ellipticity", "channel": "W1", "amplitude": 0.02}]},
+        {"sky": run["sky"] | {"dipole_uk": 0.0}},
+        {"preparation": [{"kind": "subtract_dipole"}]},
+    ):
+        assert expectation.dipoles_left(survey(config.load(run | quiet))) == {}
+
+
 def test_what_is_fitted_behind_a_mask_is_the_beam(tmp_path: Path) -> None:
     """In paired differences and in plain spectra, which the mask has a share of."""
     mask = np.sin(0.5 * np.pi * np.clip((X + 0.8) / 0.4, 0.0, 1.0)) ** 2
