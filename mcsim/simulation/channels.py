@@ -165,6 +165,8 @@ def check_effects(run: config.RunConfig) -> None:
                 refuse_pixel_effects(spec.name, acting)
             if isinstance(spec.scan, config.ScanDifferencing):
                 refuse_excess(spec.name, acting)
+            else:
+                refuse_differences(spec.name, acting)
             systematics.tried(acting, site_of(run, spec))
 
 
@@ -181,6 +183,16 @@ def refuse_excess(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
             f"effect {effect.name} on channel {channel} adds noise to samples of one beam, but the scan takes "
             "differences; remove it, or use noise.sigma0_uk."
         )
+
+
+def refuse_differences(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
+    """Refuse effects on the differences of two beams where the scan takes none."""
+    for effect in acting:
+        if effect.amplitude != 0.0 and type(effect).differencing is not systematics.Effect.differencing:
+            raise InputError(
+                f"effect {effect.name} on channel {channel} acts on differences of two beams, but the scan takes none; "
+                'remove it, or give a scan of kind "differencing".'
+            )
 
 
 def with_offsets(moments: scan.Moments, order: int, spec: config.Channel) -> scan.Moments:

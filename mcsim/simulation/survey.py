@@ -17,6 +17,7 @@ from mcsim.simulation import convolve, mapmaking
 from mcsim.simulation.channels import (
     effects_on,
     in_channel,
+    refuse_differences,
     refuse_excess,
     refuse_external,
     refuse_pixel_effects,
@@ -215,6 +216,8 @@ def _channel(
     library: Library | None,
 ) -> Channel:
     acting = effects_on(run, spec.name, library)
+    if not isinstance(spec.scan, config.ScanDifferencing):
+        refuse_differences(spec.name, acting)
     site = site_of(run, spec)
     if run.map.grid == "gl":
         return _channel_on_rings(run, spec, site, acting)

@@ -14,6 +14,7 @@ from mcsim.beamfit.effective_beam import fit_models
 from mcsim.errors import InputError
 from mcsim.simulation.channels import check_effects
 from mcsim.simulation.nuisance import check_nuisances
+from mcsim.simulation.survey import survey
 from refusals import refused
 
 LMAX, NSIDE = 12, 8
@@ -240,6 +241,13 @@ def test_arguments_of_another_kind_are_named(wrong, named) -> None:
 def test_an_effect_without_amplitude_is_warned_of() -> None:
     with pytest.warns(UserWarning, match="calibration has no amplitude"):
         check_effects(mcsim.load_config(run(effect=[{"name": "calibration", "channel": "W"}])))
+
+
+@pytest.mark.parametrize("scan", [{"kind": "parallel_transport"}, {"kind": "hit_averaged", "model": "planck"}])
+def test_an_effect_on_differences_is_refused_where_there_are_none(scan) -> None:
+    effect = {"name": "transmission_imbalance", "channel": "W", "amplitude": 0.01}
+    with refused("transmission_imbalance", "W", "differencing"):
+        survey(mcsim.load_config(run(effect=[effect], channel=[CHANNEL | {"scan": scan}])))
 
 
 @pytest.mark.parametrize(
