@@ -13,6 +13,7 @@ from mcsim import config
 from mcsim.ensemble import plan
 from mcsim.errors import InputError
 from mcsim.simulation import sampled, simulate
+from mcsim.simulation.channels import check_effects
 from mcsim.simulation.survey import survey
 from mcsim.sphere.checks import check_whole
 from mcsim.sphere.header import first_table, opened
@@ -105,6 +106,7 @@ def write_maps(
     if not missing:
         return list(targets.values())
     config.check_skies(run, wanted)
+    check_effects(run)
     threads = nthreads or os.cpu_count() or 1
     with reporting("orientation moments", 1.0, "", quiet) as report:
         shared = survey(run, nthreads=threads, progress=report)

@@ -95,7 +95,7 @@ def effects_on(
             effect = systematics.build(kind, entry.parameters, beside=beside)
             check_scope(f"effect {entry.name}", kind, entry.channel, run)
         if "amplitude" not in entry.parameters:
-            warnings.warn(f"effect {entry.name} has no amplitude, so that it does nothing; give one.", stacklevel=2)
+            warnings.warn(f"effect {entry.name} has no amplitude, so that it does nothing; give one.", stacklevel=1)
         if entry.channel in (None, channel):
             acting.append(effect)
     return tuple(acting)

@@ -389,6 +389,8 @@ def tried(acting: Sequence[Effect], site: Site) -> Beam:
     for effect in adding(acting):
         site.pointed(effect.name)
         effect.signal(once, once, once, once, site)
+    for effect, _ in disturbing(acting):
+        effect.excess(once, rng.generator(0, 0, "tried"))
     return seen_through(acting, site)
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.support.arrays import divided
@@ -14,6 +15,7 @@ from mcsim.systematics.galaxy import morphology
 from mcsim.systematics.parametrization import Parametrization, PowerLaw
 
 REFERENCE_GHZ = 94.0
+STEEPEST = 50.0  #: spectral index, in absolute value: ten times that of any foreground
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +71,11 @@ class ForegroundResidual(Effect):
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         """Add the residual, but to maps that a component separation made."""
+        if abs(self.spectral_index) > STEEPEST:
+            raise InputError(
+                f"effect {self.name}: spectral_index = {self.spectral_index:g} is no foreground's; keep it within "
+                f"+-{STEEPEST:g}."
+            )
         if not site.foregrounds:
             return sky
         scale = self.amplitude * (site.frequency(self.name) / REFERENCE_GHZ) ** self.spectral_index

@@ -90,6 +90,9 @@ def _of_file(path: str, frame: str, centres: NDArray[np.float64]) -> Map:
     return np.asarray(values[healpy.vec2pix(healpy.npix2nside(values.size), *seen)])
 
 
+MOST_HITS = 1e6
+
+
 @dataclass(frozen=True, kw_only=True)
 class ExcessNoise(Effect):
     """A random fraction of the samples has a Gaussian of a larger size added, each by itself.
@@ -128,7 +131,10 @@ class ExcessNoise(Effect):
     glitch_uk: float = 500.0
 
     def excess(self, count: Vector, rng: np.random.Generator) -> Vector:
-        if self.amplitude < 0.0:
-            raise InputError(f"effect {self.name}: amplitude = {self.amplitude:g} is no fraction; give 0 or more.")
+        if not 0.0 <= self.amplitude <= MOST_HITS:
+            raise InputError(
+                f"effect {self.name}: amplitude = {self.amplitude:g} is no fraction; give 0 or more, and at most "
+                f"{MOST_HITS:g} hits of a sample."
+            )
         number = rng.poisson(self.amplitude * count)
         return np.asarray(self.glitch_uk * np.sqrt(number) * rng.standard_normal(number.size))

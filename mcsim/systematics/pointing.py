@@ -12,6 +12,8 @@ from mcsim.systematics.parametrization import Angle, Parametrization, Vector
 from mcsim.systematics.shape import displaced, smeared
 from mcsim.systematics.spacecraft import axes
 
+FARTHEST_ARCMIN = 10800.0  #: to the opposite direction
+
 
 @dataclass(frozen=True, kw_only=True)
 class PointingOffset(Effect):
@@ -45,6 +47,11 @@ class PointingOffset(Effect):
     angle_deg: float = 0.0
 
     def pointing(self, beam: Beam, site: Site) -> Beam:
+        if abs(self.amplitude) > FARTHEST_ARCMIN:
+            raise InputError(
+                f"effect {self.name}: amplitude = {self.amplitude:g} arcmin turns the beam by more than half a circle; "
+                f"keep it within +-{FARTHEST_ARCMIN:g}."
+            )
         return displaced(beam, np.deg2rad(self.angle_deg), np.deg2rad(self.amplitude / 60.0))
 
     def moved(self, theta: Vector, phi: Vector, psi: Vector) -> tuple[Vector, Vector, Vector] | None:

@@ -26,6 +26,7 @@ from mcsim.systematics.parametrization import Parametrization
 
 ENTRY_POINTS = "mcsim.effects"  #: group of entry points under which a package names its effects
 Library = Mapping[str, type[Effect]]  #: effects by name
+LARGEST = 1e12  #: of a parameter, in absolute value: far from where squares and products of maps overflow
 
 
 @cache
@@ -205,6 +206,8 @@ def _checked(what: str, value: Any, default: Any) -> Any:
     if isinstance(value, bool) or not isinstance(value, Real) or not isfinite(value):
         raise InputError(f"{what} = {shown!r} must be a finite number.")
     number = float(value)
+    if abs(number) > LARGEST:
+        raise InputError(f"{what} = {value!r} is larger than anything of a survey ({LARGEST:g}); correct its unit.")
     if what.endswith(": lat_deg") and abs(number) > 90.0:
         raise InputError(f"{what} = {value!r} is no latitude; give -90 to 90, and the longitude as lon_deg.")
     return number

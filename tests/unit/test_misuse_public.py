@@ -1,5 +1,7 @@
 """What a newcomer gives by mistake to the public names: each ends in the right number or in a sentence."""
 
+from pathlib import Path
+
 import healpy
 import numpy as np
 import pandas
@@ -11,6 +13,7 @@ from astropy.io import fits
 import mcsim
 from mcsim import Beam, Moments, config, systematics
 from mcsim.beamfit.effective_beam import fit_models
+from mcsim.ensemble.maps import write_maps
 from mcsim.errors import InputError
 from mcsim.simulation.channels import check_effects
 from mcsim.simulation.nuisance import check_nuisances
@@ -241,6 +244,28 @@ def test_arguments_of_another_kind_are_named(wrong, named) -> None:
 def test_an_effect_without_amplitude_is_warned_of() -> None:
     with pytest.warns(UserWarning, match="calibration has no amplitude"):
         check_effects(mcsim.load_config(run(effect=[{"name": "calibration", "channel": "W"}])))
+
+
+@pytest.mark.parametrize(
+    ("effect", "named"),
+    [
+        ({"name": "spectrum", "amplitude": 3.0, "bands": [-1.0, 0.0, 0.0, 0.0, 0.0, 0.0]}, ("spectrum", -3.0)),
+        ({"name": "lensing", "amplitude": -0.5}, ("lensing", -0.5)),
+        ({"name": "excess_noise", "channel": "W", "amplitude": -0.1}, ("excess_noise", -0.1)),
+        ({"name": "excess_noise", "channel": "W", "amplitude": 1e9}, ("excess_noise", 1e9, 1e6)),
+        ({"name": "noise_level", "channel": "W", "amplitude": 1e300}, ("noise_level", 1e300, 1e12)),
+        ({"name": "pointing_offset", "channel": "W", "amplitude": 1e6}, ("pointing_offset", 1e6, 10800.0)),
+        ({"name": "foreground_residual", "amplitude": 1.0, "spectral_index": -1e4}, ("spectral_index", -1e4, 50.0)),
+        ({"name": "transmission_imbalance", "channel": "W", "amplitude": 0.01}, ("transmission_imbalance", "W")),
+        ({"name": "mapmaking_convergence", "channel": "W", "amplitude": 5.0}, ("mapmaking_convergence", "W")),
+    ],
+)
+def test_an_effect_that_cannot_be_is_refused_before_a_store_is_made(effect, named, tmp_path: Path) -> None:
+    model = mcsim.load_config(run(effect=[effect]))
+    for make in (lambda: mcsim.run(model, tmp_path / "x.zarr"), lambda: write_maps(model, tmp_path / "maps", 0)):
+        with refused(*named):
+            make()
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("scan", [{"kind": "parallel_transport"}, {"kind": "hit_averaged", "model": "planck"}])

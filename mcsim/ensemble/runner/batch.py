@@ -17,6 +17,7 @@ from mcsim.ensemble.runner.cluster import LOST, Roll, Workers, answers, check_wo
 from mcsim.ensemble.tasks import Failure, Job, packages, realize_chunk, summarise_node
 from mcsim.errors import InputError, RunError
 from mcsim.simulation import power, simulate
+from mcsim.simulation.channels import check_effects
 from mcsim.simulation.survey import Survey, survey
 from mcsim.stats import streaming
 from mcsim.stats.streaming import Sums
@@ -105,6 +106,7 @@ def run(
         (plan.check_summarised if resume and store.headless(target) else plan.check_same)(target, loaded)
     store.check_writable(target)
     config.check_skies(loaded, wanted)
+    check_effects(loaded)
     journal = Journal(target, quiet)
     with ExitStack() as stack:
         client = None
