@@ -13,6 +13,7 @@ from mcsim import config, systematics
 from mcsim.config.messages import standing
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
+from mcsim.instrument.beams.coefficients import power_by_order
 from mcsim.instrument.scan.offsets import HIGHEST
 from mcsim.sphere import rotation
 from mcsim.support import resources
@@ -22,6 +23,8 @@ WHOLE = 4  #: orders that a beam has at least without its m_max, where its sourc
 
 NEGLECTED = 1e-9
 """Share of a beam's power that its orders may leave out where maps are told apart by less than a run's own accuracy."""
+
+LOST = 0.01  #: share of the power of a change of the beam that a file of moments may leave out in silence
 
 MOST_ORDERS = 8
 """Highest order that is added for it: every one is a transform more, and noise of a measured beam has them all."""
@@ -167,7 +170,26 @@ def check_effects(run: config.RunConfig) -> None:
                 refuse_excess(spec.name, acting)
             else:
                 refuse_differences(spec.name, acting)
-            systematics.tried(acting, site_of(run, spec))
+            site = site_of(run, spec)
+            _warn_of_orders(run, spec, systematics.tried(acting, site), site.beam)
+
+
+def _warn_of_orders(run: config.RunConfig, spec: config.Channel, beam: beams.Beam, fiducial: beams.Beam) -> None:
+    """Warn of a change of the beam whose orders the file of moments of a channel does not have."""
+    if not isinstance(spec.scan, config.ScanMoments) or beam.mmax <= fiducial.mmax:
+        return
+    paths = [config.channel_path(spec.scan.path, spec.name, split) for split in run.map.each_split]
+    smax = min(scan.read_moments(path).smax for path in paths)
+    change = beam.blm.copy()
+    change[: fiducial.mmax + 1] -= fiducial.blm
+    power = power_by_order(change)
+    lost = float(power[smax + 1 :].sum() / power.sum())
+    if lost > LOST:
+        warnings.warn(
+            f"effects give the beam of {spec.name} orders up to {beam.mmax}, but its moments end at s = {smax}, "
+            f"which leaves out {100.0 * lost:.0f} % of the power of the change; give moments up to s = {beam.mmax}.",
+            stacklevel=3,
+        )
 
 
 def refuse_excess(channel: str, acting: tuple[systematics.Effect, ...]) -> None:

@@ -1,5 +1,6 @@
 """What a newcomer gives by mistake to the public names: each ends in the right number or in a sentence."""
 
+import warnings
 from pathlib import Path
 
 import healpy
@@ -15,6 +16,7 @@ from mcsim import Beam, Moments, config, systematics
 from mcsim.beamfit.effective_beam import fit_models
 from mcsim.ensemble.maps import write_maps
 from mcsim.errors import InputError
+from mcsim.instrument.scan import write_moments_fits
 from mcsim.simulation.channels import check_effects
 from mcsim.simulation.nuisance import check_nuisances
 from mcsim.simulation.survey import survey
@@ -244,6 +246,19 @@ def test_arguments_of_another_kind_are_named(wrong, named) -> None:
 def test_an_effect_without_amplitude_is_warned_of() -> None:
     with pytest.warns(UserWarning, match="calibration has no amplitude"):
         check_effects(mcsim.load_config(run(effect=[{"name": "calibration", "channel": "W"}])))
+
+
+@pytest.mark.parametrize(("smax", "warned"), [(2, True), (3, False)])
+def test_orders_that_a_file_of_moments_lacks_are_warned_of(smax, warned, tmp_path: Path) -> None:
+    """A coma has m = 1 and 3: without the latter its response is another one."""
+    path = tmp_path / "moments.fits"
+    write_moments_fits(path, Moments.parallel_transport(nside=NSIDE, smax=smax))
+    channel = CHANNEL | {"scan": {"kind": "moments", "path": str(path)}}
+    coma = {"name": "beam_coma", "channel": "W", "amplitude": 0.1}
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        check_effects(mcsim.load_config(run(effect=[coma], channel=[channel])))
+    assert [f"end at s = {smax}, which leaves out 10 %" in str(one.message) for one in told] == [True] * warned
 
 
 @pytest.mark.parametrize(
