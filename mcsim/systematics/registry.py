@@ -11,11 +11,12 @@ from dataclasses import fields
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import cache_from_source
 from math import inf, isfinite
 from numbers import Real
 from pathlib import Path
 from sys import float_info
-from types import MappingProxyType
+from types import MappingProxyType, ModuleType
 from typing import Any
 
 from mcsim.errors import InputError
@@ -27,6 +28,7 @@ from mcsim.systematics.parametrization import Parametrization
 ENTRY_POINTS = "mcsim.effects"  #: group of entry points under which a package names its effects
 Library = Mapping[str, type[Effect]]  #: effects by name
 LARGEST = 1e12  #: of a parameter, in absolute value: far from where squares and products of maps overflow
+_EFFECTS = "mcsim_effects"  #: attribute of a module that holds the content of its file when it was run, and its effects
 
 
 @cache
@@ -136,16 +138,24 @@ def of_file(path: str) -> type[Effect]:
     return found[0]
 
 
-@cache
 def in_file(path: str) -> tuple[type[Effect], ...]:
     """Return the effects that a Python file defines; InputError if it cannot be run, or an effect is not whole.
 
     The file becomes a module by its stem, and its folder is on the path of this process and those that it starts:
-    workers can then load the effects as well.
+    workers can then load the effects as well. A file that has another content than before is run again.
     """
     file = Path(path).absolute()
     if not file.is_file():
         raise InputError(f"{path} is no file; name a Python file that defines a class derived from mcsim.Effect.")
+    content = file.read_bytes()
+    before = sys.modules.get(file.stem)
+    if before is not None and _path_of(before) == file:
+        kept: tuple[bytes, tuple[type[Effect], ...]] = getattr(before, _EFFECTS, (content, ()))
+        if kept[0] == content and kept[1]:
+            return kept[1]
+        if kept[0] != content:
+            del sys.modules[file.stem]
+            Path(cache_from_source(file)).unlink(missing_ok=True)  # it would serve a file of the same second and size
     folder = str(file.parent)
     sys.path.insert(0, folder)
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (folder, os.environ.get("PYTHONPATH"))))
@@ -153,8 +163,8 @@ def in_file(path: str) -> tuple[type[Effect], ...]:
         module = import_module(file.stem)
     except Exception as error:  # whatever a foreign file does when it is run
         raise InputError(f"{path} cannot be run ({error}); mend it.") from error
-    if Path(str(module.__file__)).absolute() != file:
-        raise InputError(f"{path} has the name of another module, {module.__file__}; rename it.")
+    if _path_of(module) != file:
+        raise InputError(f"{path} has the name of another module, {_path_of(module)}; rename it.")
     found = tuple(
         kind
         for _, kind in inspect.getmembers(module, inspect.isclass)
@@ -163,7 +173,12 @@ def in_file(path: str) -> tuple[type[Effect], ...]:
     for kind in found:
         if (flaw := _flaw(kind)) is not None:
             raise InputError(f"the effect {kind.__name__} of {path} {flaw}; mend it.")
+    setattr(module, _EFFECTS, (content, found))
     return found
+
+
+def _path_of(module: ModuleType) -> Path:
+    return Path(str(getattr(module, "__file__", None))).absolute()  # what is built in has none
 
 
 def build(

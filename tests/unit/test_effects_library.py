@@ -1,5 +1,6 @@
 """Every effect: found by name, none at zero amplitude, and the same again from its linear components."""
 
+import sys
 from dataclasses import dataclass, fields
 from importlib.metadata import EntryPoint
 
@@ -304,3 +305,28 @@ def test_effects_of_one_name_draw_apart(site):
     assert np.array_equal(systematics.looked_at([once], sky, site, 1, 0), alone)
     correlation = np.mean((alone * (both - alone).conj())[LMAX + 1 :]).real / np.sqrt(power[0] * power[1])
     assert abs(correlation) < 4.0 / np.sqrt(2.0 * alone[LMAX + 1 :].size)
+
+
+def test_a_file_that_is_written_anew_is_run_anew(tmp_path, monkeypatch):
+    """A second diagnosis writes its effects over those of the first, which this process may have used already."""
+    monkeypatch.setattr("sys.path", list(sys.path))
+    monkeypatch.setenv("PYTHONPATH", "")
+    path = tmp_path / "unlisted_of_two.py"
+    lines = "from mcsim.reconstruction import AddedPattern\n\n\nclass Of(AddedPattern):\n    name = 'of'\n"
+    for value in (1.0, 2.0, 1.0):  # as long as before, and written in the same second
+        path.write_text(f"{lines}    coefficients = ({value},)\n")
+        kind = systematics.get(str(path))
+        assert kind.coefficients == (value,)
+        assert systematics.get(str(path)) is kind
+        assert vars(sys.modules["unlisted_of_two"])["Of"] is kind  # as workers find it
+    path.write_text("1 / 0\n")
+    with refused(str(path)):
+        systematics.get(str(path))
+
+
+def test_a_file_named_like_a_module_of_python_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.path", list(sys.path))
+    monkeypatch.setenv("PYTHONPATH", "")
+    (tmp_path / "time.py").write_text("x = 1\n")
+    with refused(str(tmp_path / "time.py")):
+        systematics.get(str(tmp_path / "time.py"))
