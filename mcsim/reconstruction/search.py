@@ -333,7 +333,7 @@ class Search:
         if not structure.of_variances:
             return 1.0
         if structure.kind in ("power", "spectrum"):
-            rows, x = structure.of(self.simulations), structure.of(scores)
+            rows, x = (self._squares(structure, one) for one in (self.simulations, scores))
             a = x / rows.mean(axis=0) - 1.0
         else:
             ((theta, _),) = self.fit([structure], scores)
@@ -341,6 +341,18 @@ class Search:
             a = real.field(np.asarray(pattern), *healpy.pix2vec(COARSE, np.arange(12 * COARSE**2)))
         a = np.maximum(a, LARGEST_FALL)
         return float(2.0 * np.sum(a - np.log1p(a)) / np.sum(a**2)) if np.any(np.abs(a) > TINY) else 1.0
+
+    def _squares(self, structure: Structure, scores: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the sums of squares whose relative change powers are, from scores (..., P).
+
+        What two splits of a channel have in common is a b = |(a + b)/2|^2 - |(a - b)/2|^2, below zero on average where
+        the filter has taken the sky out of their sum; more of it is in the first part alone.
+        """
+        found = structure.of(scores)
+        if structure.stage != "added":
+            return found
+        own = (one for one in self.grammar if (one.kind, one.channel) == ("spectrum", structure.channel))
+        return found + 0.25 * next(own).of(scores)
 
     def fit(self, chosen: Sequence[Structure], scores: Vector) -> list[tuple[Vector, Matrix]]:
         """Return the coordinates of structures, fitted together, and the covariance of each.

@@ -141,6 +141,27 @@ def test_large_variances_are_judged_by_their_likelihood(stage, kind, unit):
     assert fall == pytest.approx(9.0, rel=0.2)
 
 
+def test_power_of_one_channel_is_judged_by_that_of_the_sum_of_its_splits():
+    """Their products are below zero on average, where the sky is taken out of their sum: more power is more of it."""
+    n, a, left = 500, 10.0, 0.3
+
+    def scores(half_sum, half_difference):
+        squares = [np.sum(one**2, axis=-1) for one in (half_sum, half_difference)]
+        return np.stack([4.0 * squares[1], squares[0] - squares[1]], axis=-1)
+
+    draws = np.random.default_rng(3).normal(size=(401, 2, n)) * np.array([left, 1.0])[:, None]
+    noise = Structure("noise", "", "", "spectrum", "W1", ALIKE, None, np.array([[0]]), np.ones(1))
+    power = Structure("added", "", "sky", "power", "W1", ALIKE, None, np.array([[1]]), np.ones(1))
+    search = Search((noise, power), scores(draws[:400, 0], draws[:400, 1]))
+    assert search.simulations[:, 1].mean() < 0.0
+    mean = search.simulations.mean(axis=0)
+    more = n * left**2 * a
+    fall = search._falls(mean + np.array([0.0, more]))[1]
+    promised = more**2 / (2.0 * n * (left**4 + 1.0))  # by the score, whose variance is that of both squares
+    share = 2.0 * (a - np.log1p(a)) / a**2
+    assert fall == pytest.approx(promised * share, rel=5.0 * np.sqrt(2.0 / 400))
+
+
 def test_a_choice_among_many_is_charged():
     """Odds of one among n are shared by all, and what others had been chosen in simulations counts in p-values."""
     chosen, simulations, _ = toy(400)
