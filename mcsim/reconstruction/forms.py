@@ -29,6 +29,9 @@ from mcsim.systematics.sky import Boost
 from mcsim.systematics.spacecraft import axes, heading, line_of_sight, orientation, spin_phase
 
 REFERENCE_GHZ = 94.0
+Towards = tuple[tuple[float, ...], ...]
+"""Unit vectors, along x and y of a beam and outward, each with a weight."""
+
 _NSIDE = 128  #: of the map that a pattern of low degree is looked up in
 
 
@@ -305,8 +308,7 @@ class Elsewhere(Form):
     orders.
     """
 
-    #: unit vectors, along x and y of the beam and outward, and their weights
-    towards: ClassVar[tuple[tuple[float, float, float, float], ...]]
+    towards: ClassVar[Towards | dict[str, Towards]]  #: where it is from; by channel, if that differs in their frames
     factor: ClassVar[float]
     on_dipole: ClassVar[bool] = True
     top: ClassVar[int]
@@ -314,7 +316,7 @@ class Elsewhere(Form):
     def beam(self, beam: Beam, site: Site) -> Beam:
         """Add Y*_lm of the directions, as of a beam that points there."""
         top = min(self.top, beam.lmax)
-        *vector, weight = np.array(self.towards).T
+        *vector, weight = np.array(self._there(site.channel)).T
         lobe = points(np.array(vector), weight, top)
         kernel = site.beam.blm[0, : top + 1].real * np.sqrt(4.0 * np.pi / (2.0 * np.arange(top + 1) + 1.0))
         kernel[: 0 if self.on_dipole else 2] = 0.0
@@ -324,6 +326,17 @@ class Elsewhere(Form):
             here = slice(alm_.start(top, m) + m, alm_.start(top, m) + top + 1)
             blm[m, m : top + 1] += self.amplitude * self.factor * kernel[m:] * lobe[here]
         return replace(beam, blm=blm)
+
+    def _there(self, channel: str) -> Towards:
+        """Return the directions of a channel; InputError for one that was not reconstructed."""
+        if not isinstance(self.towards, dict):
+            return self.towards
+        if channel not in self.towards:
+            raise InputError(
+                f"effect {self.name} was reconstructed in channels of other lines of sight, {', '.join(self.towards)}, "
+                f"and does not know that of {channel}; name the channels so."
+            )
+        return self.towards[channel]
 
 
 @dataclass(frozen=True, kw_only=True)

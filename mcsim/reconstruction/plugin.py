@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mcsim.reconstruction.forms import FORMS, Form
+from mcsim.reconstruction.forms import FORMS, Form, Towards
 from mcsim.reconstruction.grammar import ALIKE, ANY, LOBE, OPPOSITE, Structure
 from mcsim.reconstruction.scores import ELSEWHERE, MONTH, Scene
 from mcsim.reconstruction.time_functions import HISTORIES
@@ -125,9 +125,7 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
         case "gain", "time" | "spacecraft":
             return "GainOfOne", {"on_sky": structure.acts_on == "sky", **timed}
         case "elsewhere", _ if alike:
-            channel = 0 if structure.channel is None else scene.channels.index(structure.channel)
-            towards = tuple(tuple(map(float, one)) for one in scene.elsewhere[channel][structure.kind])
-            acting = {"towards": towards, "on_dipole": "dipole" in structure.acts_on}
+            acting = {"towards": _towards(structure, scene), "on_dipole": "dipole" in structure.acts_on}
             return "Elsewhere", {"factor": float(theta[0]), "top": ELSEWHERE, **acting}
         case "gain", _ if not alike:
             value = float(theta[0]) / (1.0 if structure.acts_on == "dipole" else CONSTANT)
@@ -193,3 +191,12 @@ def _numbers(structure: Structure, theta: Vector) -> tuple[float, ...]:
 
 def _factors(split: str, splits: Sequence[str]) -> tuple[float, ...]:
     return (1.0, -1.0) if split == OPPOSITE else tuple(float(name == split) for name in splits)
+
+
+def _towards(structure: Structure, scene: Scene) -> Towards | dict[str, Towards]:
+    """Return where a signal from elsewhere is from: in the frame of every beam alike, or by channel."""
+    pairs = zip(scene.channels, scene.elsewhere, strict=True)
+    found = {name: there[structure.kind] for name, there in pairs if structure.channel in (None, name)}
+    each = {name: tuple(tuple(map(float, one)) for one in rows) for name, rows in found.items()}
+    first, *others = found.values()
+    return each if any(not np.allclose(first, one, atol=1e-9) for one in others) else next(iter(each.values()))

@@ -257,6 +257,24 @@ def test_a_pointing_that_moves_moves_the_dipole(wave, coordinates):
     assert np.std(difference) < 0.05 * np.std(expected[hits > 0])
 
 
+def test_a_signal_from_elsewhere_is_from_where_each_channel_has_it():
+    """Half a spin away is another direction of its frame for a beam at another angle to the spin axis."""
+    there = tuple(simulated_scores.directions(own, {}) for own in ((70.0, 0.0), (35.0, 40.0), (70.0, 180.0)))
+    scene = SimpleNamespace(channels=("V1", "W1", "Q1"), elsewhere=there, frame="ecliptic", timed=True)
+    every = next(w for w in grammar() if (w.stage, w.kind, w.channel) == ("elsewhere", "spin 1/2", None))
+    beam = Beam.gaussian(300.0, 12)
+    effect = plugin("unlisted_1", every, np.full(1, 0.1), scene)
+    made = effect.kind()(amplitude=1.0)
+    for channel in scene.channels:
+        site = systematics.Site(channel, 94.0, "ecliptic", NSIDE, 12, beam)
+        alone = plugin("unlisted_1", replace(every, channel=channel), np.full(1, 0.1), scene).kind()(amplitude=1.0)
+        np.testing.assert_array_equal(made.beam(beam, site).blm, alone.beam(beam, site).blm)
+    with refused("V1, W1, Q1", "K1"):
+        made.beam(beam, systematics.Site("K1", 94.0, "ecliptic", NSIDE, 12, beam))
+    alike = SimpleNamespace(**{**vars(scene), "channels": ("V1", "Q1"), "elsewhere": there[::2]})
+    assert isinstance(plugin("unlisted_1", every, np.ones(1), alike).values["towards"], tuple)
+
+
 def test_another_channel_sees_the_dipole_where_its_line_of_sight_points():
     """The dipole in the frame of one beam, seen along the line of another, is the dipole of that line's pointing."""
     run, scene, _, _ = seen()
