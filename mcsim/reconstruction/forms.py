@@ -218,8 +218,8 @@ class InTime(Form):
         if not self.wave:
             return np.full(len(time_s), self.coefficients[0])
         pointing = site.pointed(self.name)
+        self.check_frame(site)
         if self.wave == "sky":
-            self.check_frame(site)
             beam, _ = line_of_sight(pointing, time_s, site.frame)
             return np.asarray(_maps_of(self.coefficients, (0,))[0][0][healpy.vec2pix(_NSIDE, *beam)])
         if self.wave == "trend":

@@ -89,11 +89,11 @@ def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plug
         return None
     common = structure.channel is None and len(scene.channels) > 1
     scope = {"scope": "common"} if common or base == "SkyPower" else {}
-    on_sky = (
+    framed = (
         base in ("AddedPattern", "CompactSource", "GainPattern", "RotatedSky", "BoostedSky", "NoisePattern")
-        or values.get("wave") == "sky"
+        or values.get("wave") in ("sky", "orientation")  # psi is counted from the meridian of the maps
     )
-    frame = {"frame": scene.frame} if on_sky else {}
+    frame = {"frame": scene.frame} if framed else {}
     return Plugin(name, base, structure.channel or scene.channels[0], {**scope, **frame, **values})
 
 
