@@ -29,7 +29,7 @@ class Reconstructed:
     delta_chi2: float
     coordinates: int  #: number of numbers that describe it
     rms_uk: float | None  #: of what it adds to the maps that it acts in, uK; None if no effect can be like it
-    relative_error: float  #: of its amplitude
+    relative_error: float  #: of its amplitude, which for noise is that of a variance
     cause: str  #: A known effect that makes such structures, with its reference; "" if none
     alternatives: tuple[str, ...]  #: structures that are less probable by a factor of 20 at most, in plain words
     rival: dict[str, Any] | None  #: WORDS of another description, less probable by a factor of 4 at most
@@ -46,7 +46,10 @@ class Reconstructed:
     def sentence(self) -> str:
         """Return what is missing, how large it is and how significant."""
         text = self.says[:1].upper() + self.says[1:]
-        size = "" if self.rms_uk is None else f": {measured(self.rms_uk, self.rms_uk * self.relative_error, ' µK')} rms"
+        size = ""
+        if self.rms_uk is not None:
+            root = 0.5 if self.stage == "noise" else 1.0  # its amplitude is that of a variance
+            size = f": {measured(self.rms_uk, root * self.rms_uk * self.relative_error, ' µK')} rms"
         other = "" if self.rival is None else f"; or, as probable within a factor of 4, it {self.rival['says']}"
         return f"{text}{other}{size} ({p_equals(self.pvalue)})."
 

@@ -486,5 +486,6 @@ def test_every_structure_has_words_and_a_picture():
         "x",
     )
     assert "0.80 µK ± 0.08 µK" in found.sentence
+    assert "0.80 µK ± 0.04 µK" in replace(found, stage="noise").sentence  # the root of a variance known to 10 %
     assert found.to_json()["file"] == "unlisted_1.py"
     assert len(structure_figure(found, "ecliptic").axes) == 3
