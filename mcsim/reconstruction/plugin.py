@@ -1,5 +1,6 @@
 """From a structure and its coordinates to an effect: as a class for the simulator, and as a Python file."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pprint import pformat
@@ -65,10 +66,17 @@ class Plugin:
         """Return the text of a Python file that defines the effect."""
         values = {"name": self.name, "signature": sentence, **self.values}
         lines = [f"    {key} = {_literal(value)}" for key, value in values.items()]
-        channel = f'\n    channel = "{self.channel}"' if self.values.get("scope") != "common" else ""
+        of = str(self.channel)
+        toml = f"'{of}'" if '"' in of and "'" not in of else json.dumps(of, ensure_ascii=False)
+        channel = "" if self.kind().scope == "common" else f"\n    channel = {toml}"
         title = "".join(part.capitalize() for part in self.name.split("_"))
-        text = {"sentence": sentence.replace("\\", ""), "name": self.name, "base": self.base, "title": title}
-        return _FILE.format(**text, channel=channel, body="\n".join(lines))
+        text = {"sentence": _quoted(sentence), "name": self.name, "base": self.base, "title": title}
+        return _FILE.format(**text, channel=_quoted(channel), body="\n".join(lines))
+
+
+def _quoted(text: str) -> str:
+    """Return text as it stands in a docstring."""
+    return text.replace("\\", "\\\\").replace('"""', '\\"\\"\\"')
 
 
 def _literal(value: Any) -> str:

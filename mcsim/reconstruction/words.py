@@ -75,7 +75,7 @@ def _what(structure: Structure, theta: Vector) -> str:
                 return f"is added to the signal as by the Sun in a lobe, at {kind.split()[1]}° of the spin"
             return f"is added to the signal and depends on {SUN[kind]}"
         case "added", "spacecraft" if kind.startswith("line"):
-            return f"is the dipole as the line of sight of {number} sees it at the same time"
+            return f"is the dipole as the line of sight of {kind.partition(' ')[2]} sees it at the same time"
         case "elsewhere", _:
             return f"has {on} as seen elsewhere: {_there(kind)}"
         case "added", "spacecraft":
