@@ -29,6 +29,12 @@ ALTERNATIVES = 3  #: structures that are told beside the best at most
 SKIES = 4  #: skies, constrained by the data, on which a reconstructed effect is simulated
 LARGEST = 2.0  #: amplitude in a part of the data over that in all scores, at most; the least is none
 
+HIDDEN = (
+    "What is missing was looked for in maps in which the nuisances of the model have any of their values: beside "
+    "nuisances that the maps measure well, only what is much larger than these is described."
+)
+"""Note where nothing is found. Scores are no residuals after a fit of nuisances, and their squares have long tails."""
+
 FEW = 0.1  #: share of the largest rms below which a map does not have an effect
 
 
@@ -38,6 +44,8 @@ def reconstructed(result: DiagnosisResult, data: ObservedMaps, ask: Ask) -> Diag
     scene = scene_for(analysis.job(analysis.run))
     found, reduction = structures_of(data, scene, search_of(analysis, scene, ask), ask)
     settings = analysis.settings
+    if not found and analysis.run.nuisances:
+        result = replace(result, notes=(*result.notes, HIDDEN))
     if reduction is not None and reduction.refutes(settings.reduction_sigma, settings.unexplained_pvalue):
         what = " and ".join(one.says for one in found)
         note = f"What {what} fits best, and is not what is missing: {refuted(reduction)}."

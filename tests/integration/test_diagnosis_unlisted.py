@@ -2,6 +2,8 @@
 
 import json
 import sys
+from dataclasses import dataclass
+from types import SimpleNamespace
 
 import healpy
 import numpy as np
@@ -91,3 +93,22 @@ def test_an_unlisted_effect_is_described_written_and_shrinks(small, tmp_path, mo
     assert first.sentence in words.unlisted(found)
     with quick_pictures(empty=True):
         assert first.says in report.page(found)
+
+
+@pytest.mark.parametrize("nuisances", [(), ("calibration",)])
+def test_nothing_beside_nuisances_has_a_note(nuisances, monkeypatch):
+    """Nuisances are not fitted before the search: nothing found beside them is no finding."""
+
+    @dataclass(frozen=True)
+    class Result:
+        notes: tuple[str, ...] = ("first",)
+        unlisted: tuple[()] | None = None
+        unlisted_held_out: None = None
+
+    for name, value in (("scene_for", None), ("search_of", None), ("structures_of", ((), None))):
+        monkeypatch.setattr(unlisted, name, lambda *_, value=value: value)
+    run = SimpleNamespace(nuisances=nuisances)
+    analysis = SimpleNamespace(run=run, job=lambda _: None, settings=None)
+    found = unlisted.reconstructed(Result(), SimpleNamespace(context=SimpleNamespace(analysis=analysis)), None)
+    assert found.unlisted == ()
+    assert found.notes == ("first", *((unlisted.HIDDEN,) if nuisances else ()))
