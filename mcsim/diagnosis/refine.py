@@ -7,11 +7,14 @@ import numpy as np
 
 from mcsim.datavector.candidate import Candidate, columns_of, coordinates_of, effects_at, lost, parts_of, scatters_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
-from mcsim.diagnosis.selection import Attribution, Selection, attributed
+from mcsim.diagnosis.selection import Attribution, Explanation, Selection, attributed
 from mcsim.errors import InputError
+from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit
 from mcsim.stats.scattered import Acting, with_drawn_scatter
 from mcsim.support.arrays import Matrix, Vector
+
+ALIKE = 0.7  #: cosine of linear responses from which on one candidate can pass for another
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,8 @@ class Refiner:
         response is kept, of any other one by how much it scatters the data. Where the power of an effect counts,
         which grows as the square of the amplitude, the secant at a_0 finds a^2/a_0 for a: the mean of this and a_0 is
         Newton's step. With the scatter that it has at the amplitude of a set, a stochastic one may not suffice though
-        it is all: it is tried at the amplitude that it has alone, too. Members of the best sets are always simulated.
+        it is all: it is tried at the amplitude that it has alone, too. Members of the best sets are always simulated,
+        and what is like them where a set suffices only because errors of templates are tolerated.
         """
         now = _Responses(t, t.copy(), list(candidates))
         found = self._attribute(now.t, now.candidates)
@@ -113,10 +117,41 @@ class Refiner:
             parts = [part for one in best for part in parts_of(now.candidates, one.members, one.fit)]
             untried = {part[0]: part for part in parts if part[0] not in now.done}
             changed = [self._simulate(now, *part) for part in untried.values()]
+            changed += [self._simulate_in_place(now, *place) for one in best for place in self._alike(now, one)]
             if not any(changed):
                 break
             found = self._attribute(now.t, now.candidates)
         return found
+
+    def _alike(self, now: "_Responses", one: Explanation) -> list[tuple[tuple[int, ...], int]]:
+        """Return candidates that were not simulated and are like a member of a set, behind the other members.
+
+        None if the residual passes without an error of the templates. Far from linear responses what is tolerated is
+        much, and what is there looks worse than what is like it until it is simulated.
+        """
+        if one.fit.pvalue > self.context.settings.residual_level:
+            return []
+        cosine = cosines(self.context.null.whiten_groups(now.linear, [own.columns for own in now.candidates]))
+        found: dict[int, tuple[int, ...]] = {}
+        for member in one.members:
+            others = tuple(other for other in one.members if other != member)
+            taken = {now.candidates[other].identity for other in others}
+            for index in np.flatnonzero(cosine[member] >= ALIKE).tolist():
+                if index not in now.done and now.candidates[index].identity not in taken:
+                    found.setdefault(index, others)
+        return [(others, index) for index, others in found.items()]
+
+    def _simulate_in_place(self, now: "_Responses", others: tuple[int, ...], index: int) -> bool:
+        """Simulate a candidate beside others at its amplitude until that settles; return True if anything changed."""
+        changed = False
+        for _ in range(self.context.settings.refine_rounds):
+            together = (*others, index)
+            fit = self.context.null.fit(self.data.x, now.t[:, columns_of(now.candidates, together)])
+            *_, part = parts_of(now.candidates, together, fit)
+            if not self._simulate(now, *part, curved=True):
+                break
+            changed = True
+        return changed
 
     def _simulate(
         self, now: "_Responses", index: int, coordinates: Vector, covariance: Matrix, curved: bool = False

@@ -97,6 +97,26 @@ def test_a_rival_is_simulated_at_its_amplitude_though_another_is_named():
     assert {one.members for one in found.explanations} == {(0,), (2,)}
 
 
+def test_what_is_like_a_member_is_simulated_where_a_set_suffices_by_tolerance_alone():
+    """C has the response of A at its amplitude but for 0.9 %: 1 % is tolerated, which is ten standard deviations."""
+    instrument = Instrument(bend=0.0005, cross=0.0)
+    instrument.curvature = np.zeros_like(instrument.curvature)
+    x = instrument.response(1000.0, 0.0)
+    along = x / np.linalg.norm(x)
+    instrument.t[:, 2] = along + 0.009 * instrument.sideways[1]
+    plain = attribute(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration)
+    assert [one.members for one in plain.explanations] == [(2,)]
+    assert plain.explanations[0].fit.pvalue < 1e-3 < 0.02 < plain.explanations[0].pvalue
+    found = instrument.refined(x).attribution
+    assert [one.members for one in found.explanations] == [(0,)]
+    assert found.explanations[0].fit.amplitudes == pytest.approx([1000.0], rel=1e-3)
+    # Where nothing has to be tolerated, nothing else is simulated.
+    instrument.analysis.clear()
+    instrument.t[:, 2] = along
+    assert [one.members for one in instrument.refined(x).attribution.explanations] == [(2,)]
+    assert all(list(tables) == ["C"] for tables in instrument.analysis)
+
+
 def test_secants_of_a_power_do_not_swing_about_the_amplitude():
     """A response that is nearly all a square: each secant by itself would be as far on the other side."""
     instrument = Instrument(bend=0.5, cross=0.0)
