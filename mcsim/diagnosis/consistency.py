@@ -189,7 +189,8 @@ class Slices:
         words = tuple(" and ".join(self.splits[fold::2]) for fold in (0, 1)) if len(self.splits) > 1 else _HALVES
         yield _of_rows("halves", words, halves)
         noisy = candidate.effect.noise is not Effect.noise  # it shows in differences of splits, and in pixels
-        edges = [e for _, e in scales(self.lmax)] if noisy else [LARGE, bins(2, self.lmax, 2)[0][1], self.lmax]
+        ends = {e for e in (LARGE, max(LARGE, bins(2, self.lmax, 2)[0][1])) if e < self.lmax}
+        edges = [e for _, e in scales(self.lmax)] if noisy else sorted({*ends, self.lmax})
         starts = (0, *(edge + 1 for edge in edges))
         words = tuple(f"ℓ {low}–{high}" for low, high in zip(starts, edges, strict=False))
         degrees: list[list[int]] = [[] for _ in edges]

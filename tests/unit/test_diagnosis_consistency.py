@@ -69,6 +69,19 @@ def test_a_hemisphere_is_kept_as_by_a_mask(model, frame):
     assert np.allclose(slices.northern(elements, frame) @ draw, masked, atol=0.02)
 
 
+@pytest.mark.parametrize("lmax", [8, 12, 13, 16, 23, 24, 40, 300])
+def test_ranges_of_degrees_follow_one_another_to_the_last(lmax):
+    """None starts behind its end, however few degrees the maps have."""
+    empty = np.zeros((0, 0))
+    nothing = NullEnsemble(empty, np.zeros(0), (), empty, empty, empty, empty, empty)
+    found = Slices(nothing, np.zeros(0), 0, ("half1", "half2"), lmax, DiagnosisSettings())._divisions(GAIN)
+    (degrees,) = (one for one in found if one.kind == "degrees")
+    ends = [tuple(map(int, word.removeprefix("ℓ ").split("–"))) for word in degrees.words]
+    assert [first for first, _ in ends] == [0, *(last + 1 for _, last in ends[:-1])]
+    assert all(first <= last for first, last in ends)
+    assert ends[-1][1] == lmax
+
+
 class Bench:
     """A gain drift that shows with opposite signs in the halves, beside noise of 400 simulations."""
 
