@@ -99,6 +99,7 @@ def _set_of(context: DiagnosisContext, one: Explanation) -> EffectSet:
         further=one.further,
         excess=excess_of(one.fit.chi2, one.fit.dimension, context.null.dof),
         maps=one.findings.maps,
+        pvalue_alone=one.fit.pvalue,
     )
 
 

@@ -65,6 +65,9 @@ class EffectSet:
     further: float  #: p-value of the most significant further candidate, with the look-elsewhere effect
     excess: Measured
     maps: tuple[MapCheck, ...] = ()  #: largest scales of the maps before and after the effects are taken out
+    #: p-value of the residual if neither an error of the responses nor the scatter that the effects add is tolerated;
+    #: None in results of earlier versions
+    pvalue_alone: float | None = None
 
     @property
     def label(self) -> str:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from mcsim.datavector.localisation import Place
 from mcsim.diagnosis.nuisance import NuisanceResult
-from mcsim.diagnosis.result import Agreement, DiagnosisResult, EffectResult
+from mcsim.diagnosis.result import Agreement, DiagnosisResult, EffectResult, EffectSet
 from mcsim.diagnosis.selection import Contrast
 from mcsim.stats.excess import HeldOut, Measured
 from mcsim.support.numbers import measured, number, p_equals
@@ -94,7 +94,7 @@ def status(result: DiagnosisResult) -> str:
     if result.kind == "degenerate":
         return (
             f"{len(result.sets)} sets of effects describe the data and the data cannot choose between them. The "
-            f"residual of the most probable one {residual(best.pvalue)}."
+            f"residual of the most probable one {left_by(best)}."
         )
     many = len(best.effects) > 1
     start = f"These {len(best.effects)} effects are needed together" if many else "One effect is enough"
@@ -104,7 +104,7 @@ def status(result: DiagnosisResult) -> str:
     if best.further <= AGREES:
         beside = "the most significant further candidate is marginal"
     return (
-        f"{start}: the residual of the fit {residual(best.pvalue)}, and {beside} beside {'them' if many else 'it'} "
+        f"{start}: the residual of the fit {left_by(best)}, and {beside} beside {'them' if many else 'it'} "
         f"({p_equals(best.further)}, look-elsewhere effect included)."
     )
 
@@ -142,6 +142,15 @@ def residual(pvalue: float) -> str:
     """Return how a residual with this p-value compares with the simulations."""
     how = "agrees" if pvalue > AGREES else "is only marginally compatible" if pvalue > DISAGREES else "does not agree"
     return f"{how} with the simulations ({p_equals(pvalue)})"
+
+
+def left_by(one: EffectSet) -> str:
+    """Return how the residual of a set compares with the simulations, and if only with what is tolerated."""
+    text = residual(one.pvalue)
+    if one.pvalue_alone is None or one.pvalue <= DISAGREES or one.pvalue_alone > DISAGREES:
+        return text
+    tolerated = "an error of the response and the scatter of the effects tolerated"
+    return f"{text.removesuffix(')')} with {tolerated}, {p_equals(one.pvalue_alone)} without)"
 
 
 def held_out(result: DiagnosisResult) -> str:

@@ -279,6 +279,17 @@ def test_sentences_agree_with_the_p_values_beside_them(diagnoses, kind, fitted, 
         assert ("reservation" in words.status(result)) == (min(fitted, best.further) <= words.AGREES)
 
 
+@pytest.mark.parametrize("kind", ["effect", "mixture", "degenerate"])
+@pytest.mark.parametrize(("alone", "said"), [(0.5, False), (1e-50, True)])
+def test_what_a_residual_passes_by_is_told(diagnoses, kind, alone, said):
+    """A wrong effect of S/N 5000 passes with p = 1, as errors of 1 % of its response are tolerated."""
+    one = diagnoses[kind]
+    best = replace(one.sets[0], pvalue=1.0, pvalue_alone=alone)
+    text = words.status(replace(one, sets=(best, *one.sets[1:])))
+    assert ("tolerated, p = 10⁻⁵⁰ without)" in text or "tolerated, p = 1 × 10⁻⁵⁰ without)" in text) == said
+    assert ("agrees with the simulations (p = 1)" in text) != said
+
+
 def test_a_reduction_that_is_not_measured_is_not_quoted(diagnoses):
     one = diagnoses["effect"]
     vague = replace(one, held_out=replace(one.held_out, achieved=Measured(0.5, 2.0)))
