@@ -4,6 +4,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from mcsim.errors import InputError
+from mcsim.stats.few_draws import LEAST
+from mcsim.stats.look_elsewhere import FEWEST
 from mcsim.support.settings import check_settings
 from mcsim.systematics import Library
 
@@ -258,7 +260,10 @@ class DiagnosisSettings:
         levels = [field.name for field in fields(self) if field.name.endswith(("_level", "_pvalue", "_share"))]
         skies = ("channel_skies", "typical_skies", "common_skies", "noisy_skies", "table_skies")
         sims = ("sims_per_element", "pilot_sims_per_element")
-        least = {**dict.fromkeys((*skies, *sims), 2), "beam_orders": 1, "beam_bins": 1, "sky_bins": 1}
+        least: dict[str, float] = dict.fromkeys((*skies, *sims, "constrained_skies"), 2)
+        one = ("max_effects", "odds_cut", "beam_orders", "beam_bins", "sky_bins", "scan_bins", "scan_L_max")
+        least |= dict.fromkeys((*one, "filter_iterations"), 1)
+        least |= {"scatter_skies": LEAST, "scan_sims": FEWEST, "large_scales": 3, "plane_width": 1e-3}
         check_settings(self, ["alpha", "named_probability", *levels], least)
         edges = list(self.latitude_edges)
         if len(edges) < 2 or edges != sorted(set(edges)):

@@ -14,6 +14,8 @@ from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, WhitenedTemplates
 # Scatter matrices drawn for a calibration. Each serves many data vectors: it costs a thousand times as much.
 SCATTERS = 200
 
+FEWEST = 20  #: simulations that deviations are ranked among
+
 TAIL = 10  #: held-out simulations beyond which their ranks say nothing
 
 
@@ -195,7 +197,7 @@ def scan_pvalues(
     """Return the deviations of many correlated numbers ``x``, shape (..., B), and their global p-values.
 
     The deviations are normal deviates; the p-value of one is the probability that the largest |z| of all is at least as
-    large. ``simulations`` has the shape (N, B), N >= 20.
+    large. ``simulations`` has the shape (N, B), N >= FEWEST.
 
     Notes
     -----
@@ -204,8 +206,8 @@ def scan_pvalues(
     B_eff fitted by maximum likelihood to the upper tenth of the maxima.
     """
     count = len(simulations)
-    if count < 20:
-        raise InputError(f"{count} simulations are too few to rank deviations; give at least 20.")
+    if count < FEWEST:
+        raise InputError(f"{count} simulations are too few to rank deviations; give at least {FEWEST}.")
     centred = simulations - simulations.mean(axis=0)
     variance = np.sum(centred**2, axis=0)
     # Of N values without the i-th: mean moves by -c/(N-1), the sum of squares falls by c^2 N/(N-1).

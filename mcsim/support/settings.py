@@ -19,7 +19,7 @@ def settings_of(given: Kind | None, kind: type[Kind]) -> Kind:
     return given
 
 
-def check_settings(settings: Any, shares: Iterable[str] = (), least: Mapping[str, int] | None = None) -> None:
+def check_settings(settings: Any, shares: Iterable[str] = (), least: Mapping[str, float] | None = None) -> None:
     """Raise InputError unless the fields of a dataclass are of the kind of their defaults, and numbers not negative.
 
     Those named in ``shares`` lie between 0 and 1, and what is in ``least`` is no less than that. An ``int | None`` is
