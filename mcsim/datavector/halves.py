@@ -12,6 +12,9 @@ from mcsim.stats.excess import HeldOut, excess, expected_fall, expected_fall_of_
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 
+BENT = 0.5
+"""Share by which a simulated response may be above what was fitted: else the fit says nothing of the amplitude."""
+
 
 @dataclass(frozen=True)
 class Halves:
@@ -41,6 +44,14 @@ class Halves:
     def expected_snr(self, change: Vector) -> float:
         """Return the smaller one of the signal-to-noise ratios of a change in the two parts."""
         return min(self.used.expected_snr(change[self.first]), self.fresh.expected_snr(change[self.second]))
+
+    def exceeds(self, response: Vector, fitted: Vector, sigma: float) -> bool:
+        """Return True if a response is larger than what was fitted to the first part, shape (p,) both.
+
+        It is so by more than ``sigma`` standard deviations, and by more than the share :data:`BENT`.
+        """
+        size, expected = (self.used.expected_snr(one[self.first]) for one in (response, fitted))
+        return size - expected > max(sigma, BENT * expected)
 
     def reduction(
         self, t: Matrix, respond: Callable[[Fit], Vector], scatters: Sequence[Matrix] = (), data: str = ""

@@ -127,9 +127,9 @@ def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:
     """Fit one half of the data vector, freeze, add the effects to the simulator, and test the other half.
 
     None if there are no halves, one of them is hardly sensitive to the effects, or the half that is fitted asks for an
-    amplitude that an effect cannot have. Without splits the halves are degrees and pixels, which constrain beams and
-    pointing little. Fitted parameters that are given with an error, like a spectral index, are those of all data: the
-    powers in a half tell hardly more than an amplitude.
+    amplitude that an effect cannot have, or at which its response there is far above what was fitted. Without splits
+    the halves are degrees and pixels, which constrain beams and pointing little. Fitted parameters that are given with
+    an error, like a spectral index, are those of all data: the powers in a half tell hardly more than an amplitude.
     """
     context = data.context
     members, best = refined.attribution.explanations[0].members, refined.attribution.explanations[0].fit
@@ -156,6 +156,8 @@ def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:
             frozen = replace(frozen, amplitudes=free @ frozen.amplitudes, covariance=covariance)
         acting = tables_at(context.candidates, members, frozen)
         change: Vector = matrix @ data.respond(acting, context.settings.constrained_skies).mean(axis=0)
+        if not scatters and halves.exceeds(change, t @ frozen.amplitudes, context.settings.reduction_sigma):
+            raise InputError("the response is far from straight between the amplitudes of all data and of a half.")
         return change
 
     try:

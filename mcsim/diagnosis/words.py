@@ -157,7 +157,7 @@ def held_out(result: DiagnosisResult) -> str:
     """Return what adding the effects to the simulator does to data that the fit did not use."""
     found = result.held_out
     if found is None:
-        why = "the held-out data hardly respond to the effects, or show no excess χ² by themselves"
+        why = "a half of the data hardly measures the effects, or the held-out one shows no excess χ² by itself"
         return f"Not measured: {why if result.sets else 'no effect was added to the simulator'}."
     left = f"what remains there {residual(found.pvalue_after)}"
     if found.before.value <= 0.0 or found.achieved.sigma >= LARGEST_ERROR:

@@ -6,9 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mcsim import systematics
+from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.halves import Halves
+from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.summaries import Element
 from mcsim.diagnosis import unlisted
+from mcsim.diagnosis.inference import reduction_of
 from mcsim.stats.excess import HeldOut, Measured
 from mcsim.stats.gaussian import SimulatedGaussian
 
@@ -67,3 +72,33 @@ def test_amplitudes_of_a_part_stay_between_none_and_the_largest() -> None:
     np.testing.assert_allclose(asked[0], [9.6, 1.2, -1.4], atol=1e-9)
     # With the third at zero the second is what the data have in its place.
     np.testing.assert_allclose(asked[1], [2.0, 1.2 - 0.7, 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(("turned", "measured"), [(0.0, True), (1.0, False)])
+def test_a_half_whose_fit_its_own_response_contradicts_measures_nothing(turned, measured) -> None:
+    """Halves that see the power of two amplitudes alone; noise along the second is another power than what was fitted.
+
+    Of a strong dipole in one map without splits 129, 273 and -98 uK were frozen in place of 60, 0 and 0.
+    """
+    rng, strength, across = np.random.default_rng(7), 0.01, np.array([600.0, -600.0, 600.0, -600.0])
+    elements = tuple(Element(f"power/{k}", "noise", ("W1",), fold=k // 4) for k in range(8))
+    empty = np.zeros((0, 8))
+    ensemble = NullEnsemble(rng.normal(size=(400, 8)), np.zeros(8), elements, empty, empty, empty, empty, empty)
+    t = np.stack([np.full(8, 20.0 / strength), np.tile(across, 2)], axis=1)
+    amplitudes = np.array([strength, 0.0])
+    x = t @ amplitudes + turned * 2.5 * strength * np.concatenate([across, np.zeros(4)])
+    candidate = Candidate(systematics.get("gain_drift"), "W1", (0, 1))
+
+    def respond(tables, skies):
+        (table,) = tables
+        return np.full((skies, 8), 20.0 * (table.parameters["amplitude"] / strength) ** 2)
+
+    fit = replace(ensemble.gaussian.fit(x, t), amplitudes=amplitudes)
+    context = SimpleNamespace(
+        candidates=[candidate], null=ensemble.gaussian, ensemble=ensemble, settings=DiagnosisSettings()
+    )
+    data = SimpleNamespace(context=context, x=x, halves=lambda: (np.eye(8), "half2"), respond=respond)
+    attribution = SimpleNamespace(explanations=[SimpleNamespace(members=(0,), fit=fit)])
+    found = reduction_of(data, SimpleNamespace(attribution=attribution, templates=t, candidates=[candidate]))
+    assert (found is not None) == measured
+    assert not measured or found.achieved.value == pytest.approx(1.0, abs=0.1)
