@@ -6,8 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from mcsim.datavector.summaries import Element
-from mcsim.stats.look_elsewhere import scan_pvalues
-from mcsim.support.arrays import Map, Vector
+from mcsim.stats.look_elsewhere import deviations, scan_pvalues
+from mcsim.support.arrays import Map, Matrix, Vector
+
+FOLDS = 20  #: parts of the simulations, at most, each of which is compared with all others
 
 
 @dataclass(frozen=True)
@@ -29,30 +31,40 @@ def places(x: Vector, simulations: Vector, elements: Sequence[Element], level: f
     -----
     A kind is a frame, an L and a parity: one effect shows in every channel and split that it acts on, and a list of
     these would hide all else. The cube root of a group's sum of squared deviates is nearly normal (Wilson & Hilferty,
-    PNAS 17, 684, 1931); it is compared with those of the simulations, each taken against the others.
+    PNAS 17, 684, 1931). Deviates, and these roots, are from the mean and over the scatter of simulations: of all for
+    the data, and for each simulation of those of the other parts. Rates: tests/statistical/test_diagnose_statistics.py.
     """
-    mean, spread = simulations.mean(axis=0), simulations.std(axis=0, ddof=1)
-    spread = np.where(spread > 0, spread, np.inf)
-    deviates = (x - mean) / spread / np.sqrt(1.0 + 1.0 / len(simulations))
-    others = (simulations - mean) / spread
     groups: dict[tuple[object, ...], list[int]] = {}
     for number, e in enumerate(elements):
         groups.setdefault((e.statistic, e.channels, e.split, e.frame, e.L, e.M, e.parity), []).append(number)
-    rows = list(groups.values())
-    found = np.array([np.mean(deviates[row] ** 2) for row in rows])
-    drawn = np.stack([np.mean(others[:, row] ** 2, axis=1) for row in rows], axis=1)
-    z, p = scan_pvalues(np.cbrt(found), np.cbrt(drawn))
+    rows, count = list(groups.values()), len(simulations)
+    deviates, found, drawn = _roots(x[None], simulations, rows)
+    held_out, parts = np.empty((count, len(rows))), min(FOLDS, count // 2)
+    for part in range(parts):
+        own = np.arange(count) % parts == part
+        held_out[own] = deviations(*_roots(simulations[own], simulations[~own], rows)[1:])
+    z, p = (one[0] for one in scan_pvalues(found, drawn, held_out))
     # A group with too small deviates is no departure.
     p = np.where(z > 0, p, 1.0)
     ranked: list[tuple[bool, bool, Place]] = []
     seen: set[tuple[object, ...]] = set()
     for group in np.argsort(-z):
-        most = max(rows[group], key=lambda number: abs(deviates[number]))
+        most = max(rows[group], key=lambda number: abs(deviates[0, number]))
         place = Place(elements[most], float(z[group]), float(p[group]))
         kind = (place.element.frame, place.element.L, place.element.parity)
         ranked.append((place.p > level, kind in seen, place))
         seen.add(kind)
     return [place for _, _, place in sorted(ranked, key=lambda one: one[:2])]
+
+
+def _roots(x: Matrix, simulations: Matrix, rows: Sequence[Sequence[int]]) -> tuple[Matrix, Matrix, Matrix]:
+    """Return the deviates of data, shape (M, B), from simulations, (N, B), and the roots of groups of both."""
+    mean, spread = simulations.mean(axis=0), simulations.std(axis=0, ddof=1)
+    spread = np.where(spread > 0.0, spread, np.inf)
+    deviates = (x - mean) / spread / np.sqrt(1.0 + 1.0 / len(simulations))
+    both = (deviates, (simulations - mean) / spread)
+    found, drawn = (np.cbrt(np.stack([np.mean(z[:, row] ** 2, axis=1) for row in rows], axis=1)) for z in both)
+    return deviates, found, drawn
 
 
 def standardised(x: Map, mean: Map, scatter: Map, count: int) -> Map:

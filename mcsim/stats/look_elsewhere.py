@@ -192,29 +192,30 @@ def global_test(
 
 
 def scan_pvalues(
-    x: NDArray[np.float64], simulations: NDArray[np.float64]
+    x: NDArray[np.float64], simulations: NDArray[np.float64], held_out: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the deviations of many correlated numbers ``x``, shape (..., B), and their global p-values.
 
     The deviations are normal deviates; the p-value of one is the probability that the largest |z| of all is at least as
-    large. ``simulations`` has the shape (N, B), N >= FEWEST.
+    large. ``simulations`` has the shape (N, B), N >= FEWEST. ``held_out``, of the same shape, are the deviations of
+    each of them from others; None: from all others.
 
     Notes
     -----
-    Each simulation is compared with the others (leave one out), as the data are. p is the rank of |z| among the maxima
-    of the simulations; beyond the largest, 1 - (1 - p_1)^B_eff of the normal p_1, with the effective number of trials
-    B_eff fitted by maximum likelihood to the upper tenth of the maxima.
+    Each simulation is compared with others (leave one out), as the data are with all. p is the rank of |z| among the
+    maxima of the simulations; beyond the largest, 1 - (1 - p_1)^B_eff of the normal p_1, with the effective number of
+    trials B_eff fitted by maximum likelihood to the upper tenth of the maxima.
     """
     count = len(simulations)
     if count < FEWEST:
         raise InputError(f"{count} simulations are too few to rank deviations; give at least {FEWEST}.")
-    centred = simulations - simulations.mean(axis=0)
-    variance = np.sum(centred**2, axis=0)
-    # Of N values without the i-th: mean moves by -c/(N-1), the sum of squares falls by c^2 N/(N-1).
-    others = np.sqrt(np.maximum(variance - centred**2 * count / (count - 1), 0.0) / (count - 2))
-    held_out = centred * np.sqrt(count / (count - 1)) / others
-    maxima = np.max(np.abs(_normal(held_out, count - 2)), axis=1)
-    z = _normal((x - simulations.mean(axis=0)) / np.sqrt(variance / (count - 1) * (1.0 + 1.0 / count)), count - 1)
+    if held_out is None:
+        centred = simulations - simulations.mean(axis=0)
+        # Of N values without the i-th: mean moves by -c/(N-1), the sum of squares falls by c^2 N/(N-1).
+        left = np.sum(centred**2, axis=0) - centred**2 * count / (count - 1)
+        others = np.sqrt(np.maximum(left, 0.0) / (count - 2))
+        held_out = _normal(centred * np.sqrt(count / (count - 1)) / others, count - 2)
+    maxima, z = np.max(np.abs(held_out), axis=1), deviations(x, simulations)
     exceeding = count - np.searchsorted(np.sort(maxima), np.abs(z), side="left")
     waits = np.sort(-np.log1p(-2.0 * special.ndtr(-maxima)))
     upper = max(10, count // 10)
@@ -222,6 +223,12 @@ def scan_pvalues(
     beyond = -np.expm1(trials * np.log1p(-np.minimum(2.0 * special.ndtr(-np.abs(z)), 1.0 - 1e-12)))
     ranked = (1.0 + exceeding) / (1.0 + count)
     return z, np.where(exceeding > 0, ranked, np.minimum(ranked, beyond))
+
+
+def deviations(x: NDArray[np.float64], simulations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the normal deviates of numbers, shape (..., B), that simulations, shape (N, B), do not know."""
+    count, spread = len(simulations), simulations.std(axis=0, ddof=1)
+    return _normal((x - simulations.mean(axis=0)) / spread / np.sqrt(1.0 + 1.0 / count), count - 1)
 
 
 def _normal(t: NDArray[np.float64], dof: int) -> NDArray[np.float64]:
