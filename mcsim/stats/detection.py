@@ -128,8 +128,8 @@ def log_evidence(
     Notes
     -----
     log of the mean over j of (1 + w g_j^2)^(-K/2) L(chi2 + T/(1 + w g_j^2)), T = delta_chi2, chi2 what it leaves, L
-    and its curvature w those of :meth:`SimulatedGaussian.log_likelihood`: Occam's factor of K columns, without the
-    limit that a single width sets to strong effects.
+    that of :meth:`SimulatedGaussian.log_likelihood` and w its curvature at chi2 + T/(1 + g_j^2), where fit and prior
+    meet: Occam's factor of K columns, without the limit that a single width sets to strong effects.
     """
     T, K = np.asarray(delta_chi2), np.asarray(columns)
     chi2 = np.asarray(total) - T
