@@ -41,7 +41,7 @@ class Calibration:
 
         This is its rank among the draws, or Bonferroni's bound if that is lower, beyond the reach of the draws.
         """
-        found = np.minimum(_rank(self.smallest, smallest), self.tests * np.asarray(smallest))
+        found = np.minimum(_rank(self.smallest, smallest), max(self.tests, 1) * np.asarray(smallest))
         return _among(self.held_out_smallest, found**self.power)
 
     def combine(self, omnibus: ArrayLike, smallest: ArrayLike) -> NDArray[np.float64]:
@@ -108,6 +108,8 @@ def calibrate_in_folds(calibration: Calibration, null: SimulatedGaussian, candid
     all templates than for what is drawn like the data, so that it is too large. If p^a is uniform, log p has the mean
     -1/a: the power is estimated by maximum likelihood, within a/sqrt(N).
     """
+    if not calibration.tests:
+        return calibration
     chi2, falls = [], []
     for fold in null.folds:
         turned = fold.turn @ candidates.basis

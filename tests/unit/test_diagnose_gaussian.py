@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from mcsim.stats.gaussian import SimulatedGaussian, nested_pvalue, residual_pvalue
-from mcsim.stats.look_elsewhere import Calibration, calibrate, global_test, scan_pvalues
+from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_in_folds, global_test, scan_pvalues
 from refusals import refused
 
 P, N = 12, 60
@@ -193,3 +193,17 @@ def test_atlas_reaches_beyond_the_ranks():
     assert p[1] == 1.0
     with refused(10, 20):
         scan_pvalues(np.zeros(20), simulations[:10])
+
+
+@pytest.mark.parametrize("shrink", [False, True])
+def test_candidates_that_data_do_not_respond_to_raise_no_alarm(shrink):
+    """Of no test Bonferroni's bound would be zero: p = 0 for data of the model."""
+    rng = np.random.default_rng(8)
+    null = SimulatedGaussian.from_simulations(rng.normal(size=(200, 10)), shrink=shrink)
+    groups = null.whiten_groups(np.zeros((10, 2)), [(0,), (1,)])
+    calibration = calibrate(null, groups)
+    if shrink:
+        calibration = calibrate_in_folds(calibration, null, groups)
+    p = [global_test(null, rng.normal(size=10), groups, calibration) for _ in range(300)]
+    assert all(one.maximum == 1.0 for one in p)
+    assert stats.kstest([one.pvalue for one in p], "uniform").pvalue > 1e-3
