@@ -221,6 +221,11 @@ def _analysed(
         analysis = spectra_table.analysis_of_spectra(run, table, settings.without, threads, settings, library)
     else:
         analysis = analysis_of(run, settings.without, threads, settings, library, source)
+    if not analysis.candidates:
+        raise InputError(
+            "no effect of the library can be found in these data: none applies to the model and is not left out; leave "
+            "fewer out (--without), or give others (library)."
+        )
     power.check(analysis.model.survey)
     return run, analysis, table
 

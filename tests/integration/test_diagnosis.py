@@ -342,6 +342,8 @@ def test_an_effect_that_is_asked_for_is_not_left_out_in_silence(small, tmp_path)
         api.describe(small.run, DiagnosisSettings(including=(str(broken),)))
     with refused("mapmaking_convergence", "differencing"):
         api.describe(small.run, DiagnosisSettings(including=("mapmaking_convergence",)))
+    with refused("library", "--without"):
+        api.describe(small.run, DiagnosisSettings(without=tuple(systematics.catalogue())))
 
 
 def test_a_diagnosis_knows_the_library_that_it_is_given(tmp_path, monkeypatch):
