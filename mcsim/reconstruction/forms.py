@@ -65,34 +65,45 @@ class Form(Effect):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AddedPattern(Form):
-    """A pattern fixed to the sky is added, uK, times (frequency / 94 GHz)^``index``."""
+class OnSky(Form):
+    """What is added to the sky, times (frequency / 94 GHz)^``index``.
+
+    A ``foreground`` is not in the maps of a component separation.
+    """
+
+    index: ClassVar[float] = 0.0
+    foreground: ClassVar[bool] = False
+
+    def seen(self, site: Site) -> float:
+        """Return by what it is multiplied in a channel."""
+        if self.foreground and not site.foregrounds:
+            return 0.0
+        return (site.frequency(self.name) / REFERENCE_GHZ) ** self.index if self.index else 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class AddedPattern(OnSky):
+    """A pattern fixed to the sky is added, uK."""
 
     coefficients: ClassVar[tuple[float, ...]]
-    index: ClassVar[float] = 0.0
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         self.check_frame(site)
-        factor = self.amplitude
-        if self.index:
-            factor *= (site.frequency(self.name) / REFERENCE_GHZ) ** self.index
+        factor = self.amplitude * self.seen(site)
         return sky + factor * real.to_alm(np.array(self.coefficients), site.lmax)
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompactSource(Form):
-    """A compact source is added, of a flux in uK sr at 94 GHz, times (frequency / 94 GHz)^``index``."""
+class CompactSource(OnSky):
+    """A compact source is added, of a flux in uK sr at 94 GHz."""
 
     lon_deg: ClassVar[float]
     lat_deg: ClassVar[float]
     factor: ClassVar[float]
-    index: ClassVar[float] = 0.0
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         self.check_frame(site)
-        factor = self.amplitude * self.factor
-        if self.index:
-            factor *= (site.frequency(self.name) / REFERENCE_GHZ) ** self.index
+        factor = self.amplitude * self.factor * self.seen(site)
         return sky + factor * at((self.lon_deg, self.lat_deg), site.lmax)
 
 

@@ -220,8 +220,7 @@ def _of_maps(scene: Scene) -> Iterator[Structure]:
                 yield Structure(stage, acts_on, frame, kind, *own)
         yield from _high_orders(scene, name, views)
     yield from _modulations(scene)
-    if len({f for f in scene.frequencies if f is not None}) > 1 and None not in scene.frequencies:
-        yield from _scaled(scene)
+    yield from _scaled(scene)
 
 
 def _tried(scene: Scene, kind: str) -> float:
@@ -426,11 +425,17 @@ def _modulations(scene: Scene) -> Iterator[Structure]:
 
 
 def _scaled(scene: Scene) -> Iterator[Structure]:
-    """Yield what is added to all channels in proportion to a power of the frequency."""
-    frequencies = np.array([scene.frequencies[view.channel] or REFERENCE_GHZ for view in scene.views])
-    views = tuple(range(len(scene.views)))
-    for index in INDICES:
-        weights = (frequencies / REFERENCE_GHZ) ** index
+    """Yield what is added to all channels in proportion to a power of the frequency, but to separated components.
+
+    Beside a map of these, what all others have alike is no part of the sky itself, and has the power 0.
+    """
+    channels = [c for c, there in enumerate(scene.foregrounds) if there]
+    frequencies = [scene.frequencies[c] for c in channels]
+    if None in frequencies or len(set(frequencies)) < 2:
+        return
+    views = tuple(i for i, view in enumerate(scene.views) if view.channel in channels)
+    ratios = np.array([(scene.frequencies[scene.views[i].channel] or REFERENCE_GHZ) / REFERENCE_GHZ for i in views])
+    for index in INDICES if all(scene.foregrounds) else (0.0, *INDICES):
         for stage, acts_on, frame, kind, keys, mix in _added(scene):
-            own = None, ALIKE, index, _rows(scene, keys, views), weights, mix, views, _tried(scene, kind)
+            own = None, ALIKE, index, _rows(scene, keys, views), ratios**index, mix, views, _tried(scene, kind)
             yield Structure(stage, acts_on, frame, kind, *own)

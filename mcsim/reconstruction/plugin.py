@@ -115,16 +115,17 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
         timed = {"coefficients": (1.0,), "splits": pattern}
     elif structure.frame in ("spacecraft", "time", "Sun"):
         timed |= _wave(structure)
+    scaled = {"index": structure.index or 0.0, "foreground": structure.index is not None}
     match structure.stage, structure.frame:
         case "added", "sky" if structure.kind.startswith("orientation"):
             return "AddedToSamples", {"wave": "sky", "spins": (int(structure.kind.split()[1]),), **timed}
         case "added", "sky" if structure.kind.startswith("source"):
             lon_deg, lat_deg = map(float, structure.kind.split()[1:])
-            place = {"lon_deg": lon_deg, "lat_deg": lat_deg, "index": structure.index or 0.0}
+            place = {"lon_deg": lon_deg, "lat_deg": lat_deg, **scaled}
             return ("CompactSource", {"factor": float(theta[0]), **place}) if alike else None
         case "added", "sky" if structure.kind != "power":
             if alike:
-                return "AddedPattern", {"coefficients": pattern, "index": structure.index or 0.0}
+                return "AddedPattern", {"coefficients": pattern, **scaled}
             return "AddedToSamples", {"wave": "sky", "coefficients": pattern, **splits}
         case "added", "spacecraft" | "time" | "Sun":
             return "AddedToSamples", timed

@@ -88,6 +88,7 @@ class Scene:
     channels: tuple[str, ...]
     frequencies: tuple[float | None, ...]
     splits: tuple[str, ...]
+    foregrounds: tuple[bool, ...]  #: False: the maps of a channel are those of a component separation
     #: frame, nside, lmax: of the maps and of the filtered sky
     frame: str
     nside: int

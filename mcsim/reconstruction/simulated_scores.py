@@ -111,6 +111,7 @@ def scene_of(model: Model) -> Scene:
         channels=model.channels,
         frequencies=tuple(channel.site.frequency_ghz for channel in model.survey.channels),
         splits=splits,
+        foregrounds=tuple(channel.site.foregrounds for channel in model.survey.channels),
         frame=model.frame,
         nside=model.nside,
         lmax=model.lmax,

@@ -214,10 +214,13 @@ def _where(structure: Structure, scene: Scene) -> list[str]:
     several = len(scene.channels) > 1
     alone = f"{structure.channel} alone" if several else f"{structure.channel}"
     found = ["all channels" if structure.channel is None and several else alone]
+    if structure.index is not None and not all(scene.foregrounds):
+        found = ["all channels that have foregrounds"]
     if structure.channel is None and not several:
         found = []
     if structure.index is not None:
-        found.append(f"as the frequency to the power {structure.index:g}".replace("-", "−"))
+        power = f"as the frequency to the power {structure.index:g}".replace("-", "−")
+        found.append(power if structure.index else "alike in these")
     if len(scene.splits) > 1 and structure.views:
         same = {ALIKE: "the same in all splits", OPPOSITE: f"opposite in {' and '.join(scene.splits)}"}
         found.append(same.get(structure.split, f"in {structure.split} alone"))
