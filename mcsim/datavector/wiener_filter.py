@@ -97,8 +97,8 @@ class Model:
     response: NDArray[np.float64]  # B_l w_l of every channel, (channel, lmax + 1)
     parts: tuple[Part, ...]  # the maps in order
     dipole: Alm  # that the survey sees besides, up to lmax, uK
-    #: of all maps, if they lack a part of the sky; None, and of maps whose noise is not white or that show the sky
-    #: beyond lmax: the isotropic filter
+    #: of all maps, if they lack a part of the sky, or of their mean, if pooled; None, and of maps whose noise is not
+    #: white or that show the sky beyond lmax: the isotropic filter
     inverse: InverseCovariance | None
     white: bool  # the noise of pixels is independent, and the maps do not show the sky beyond lmax
     #: amplitude in every channel of the sky beyond lmax, sqrt(C_l) B_l w_l, uK, (channel, sky.lmax + 1); 0 if maps do

@@ -90,7 +90,7 @@ def _of_file(path: str, frame: str, centres: NDArray[np.float64]) -> Map:
     return np.asarray(values[healpy.vec2pix(healpy.npix2nside(values.size), *seen)])
 
 
-MOST_HITS = 1e6
+MOST_HITS = 1e6  #: of a sample on average: more are no glitches, and too many to count
 
 
 @dataclass(frozen=True, kw_only=True)
