@@ -11,6 +11,8 @@ from mcsim import config
 from mcsim.datavector.analysis import simulated_maps
 from mcsim.datavector.campaign import Ask, constrained_jobs
 from mcsim.datavector.halves import Halves
+from mcsim.diagnosis.fitted_nuisances import FittedNuisances, Marginal
+from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.words import refuted
@@ -30,10 +32,10 @@ SKIES = 4  #: skies, constrained by the data, on which a reconstructed effect is
 LARGEST = 2.0  #: amplitude in a part of the data over that in all scores, at most; the least is none
 
 HIDDEN = (
-    "What is missing was looked for in maps in which the nuisances of the model have any of their values: beside "
-    "nuisances that the maps measure well, only what is much larger than these is described."
+    "What is missing was looked for in maps in which {} may have any of the values that the model allows: only what is "
+    "much larger than what that makes is described."
 )
-"""Note where nothing is found. Scores are no residuals after a fit of nuisances, and their squares have long tails."""
+"""Note where nothing is found, beside nuisances that cannot be taken from maps."""
 
 FEW = 0.1  #: share of the largest rms below which a map does not have an effect
 
@@ -42,10 +44,10 @@ def reconstructed(result: DiagnosisResult, data: ObservedMaps, ask: Ask) -> Diag
     """Return the result with what is missing in the words of the grammar; ``ask`` simulates with :func:`scores`."""
     analysis = data.context.analysis
     scene = scene_for(analysis.job(analysis.run))
-    found, reduction = structures_of(data, scene, search_of(analysis, scene, ask), ask)
+    found, reduction = structures_of(data, scene, search_of(analysis, scene, ask), ask, result.nuisances)
     settings = analysis.settings
-    if not found and analysis.run.nuisances:
-        result = replace(result, notes=(*result.notes, HIDDEN))
+    if not found and (hiding := [one.title for one in analysis.nuisances if not one.subtractable]):
+        result = replace(result, notes=(*result.notes, HIDDEN.format(" and ".join(hiding))))
     if reduction is not None and reduction.refutes(settings.reduction_sigma, settings.unexplained_pvalue):
         what = " and ".join(one.says for one in found)
         note = f"What {what} fits best, and is not what is missing: {refuted(reduction)}."
@@ -54,13 +56,19 @@ def reconstructed(result: DiagnosisResult, data: ObservedMaps, ask: Ask) -> Diag
 
 
 def structures_of(
-    data: ObservedMaps, scene: Scene, search: Search, ask: Ask
+    data: ObservedMaps, scene: Scene, search: Search, ask: Ask, nuisances: Sequence[NuisanceResult] = ()
 ) -> tuple[tuple[Reconstructed, ...], HeldOut | None]:
-    """Return the structures that are found in maps, and how far they reduce the excess on held-out data."""
-    analysis = data.context.analysis
-    scene, search = with_peaks(analysis, scene, search, data.data, ask)
-    x = scores_of_maps(analysis.model, scene, data.data)
-    made = Reconstruction(data, scene, search, x)
+    """Return the structures that are found in maps, and how far they reduce the excess on held-out data.
+
+    ``nuisances``: what the data say of each component of those of the model.
+    """
+    analysis, known = data.context.analysis, FittedNuisances.of(data, nuisances)
+    clean = known.maps
+    scene, search = with_peaks(analysis, scene, search, clean.data, ask)
+    x = scores_of_maps(analysis.model, scene, clean.data)
+    marginal = known.marginal(search, scene)
+    search, x = known.marginalised(search, marginal), marginal.of(x, known.z)
+    made = Reconstruction(data, clean, scene, search, x, marginal)
     found = search.run(x, made)
     if not found:
         return (), None
@@ -112,9 +120,11 @@ class Reconstruction:
     """Simulate reconstructed effects, to find their size and to measure what they remove."""
 
     data: ObservedMaps
+    clean: ObservedMaps  # without nuisances
     scene: Scene
     search: Search
-    x: Vector
+    x: Vector  # scores
+    marginal: Marginal
     _fitted: dict[tuple[int, ...], Fitted] = field(default_factory=dict, repr=False)
     _trial: dict[int, tuple[Matrix, Matrix]] = field(default_factory=dict, repr=False)
     _kept: dict[int, tuple[Vector, Vector]] = field(default_factory=dict, repr=False)
@@ -131,7 +141,7 @@ class Reconstruction:
         acting = [(one.name, None if kinds[one.name].scope == "common" else one.channel) for one in effects]
         tables = [config.Effect(name=name, channel=channel, parameters={"amplitude": 1.0}) for name, channel in acting]
         job, plain = (
-            constrained_jobs(analysis, t, self.data.same_skies.observed, range(skies))[0] for t in (tables, [])
+            constrained_jobs(analysis, t, self.clean.same_skies.observed, range(skies))[0] for t in (tables, [])
         )
         maps = list(simulated_maps(job, {**dict(analysis.library), **kinds}))
         if share is not None:
@@ -148,7 +158,8 @@ class Reconstruction:
 
     def made(self, effects: Sequence[Plugin], share: Vector | None = None, skies: int = SKIES) -> Vector:
         """Return what effects make of all scores on these skies, shape (P,)."""
-        return np.mean(self.simulated(effects, share, skies=skies).scores - self.before.scores[:skies], axis=0)
+        change = self.simulated(effects, share, skies=skies).scores - self.before.scores[:skies]
+        return self.marginal.without(np.mean(change, axis=0))
 
     def fitted(self, chosen: Sequence[int]) -> Fitted:
         """Return coordinates and covariance of structures, their effects at amplitudes that fit, and what these leave.
@@ -205,13 +216,13 @@ class Reconstruction:
         """Return what a beam that follows a wave makes of all scores, on skies that the data constrain."""
         analysis, share = self.data.context.analysis, np.zeros((len(self.scene.views), 1))
         share[list(structure.views), 0] = structure.weights
-        plain = constrained_jobs(analysis, [], self.data.same_skies.observed, range(SKIES))[0]
+        plain = constrained_jobs(analysis, [], self.clean.same_skies.observed, range(SKIES))[0]
         found = []
         for maps in simulated_maps(plain):
             sky = filtered(analysis.model, maps).sky
             added = share * self.scene.moved(structure.moving, structure.order, theta, sky)
             found.append(scores_of_maps(analysis.model, self.scene, list(np.add(maps, added))))
-        return np.asarray(np.mean(found - self.before.scores, axis=0))
+        return self.marginal.without(np.mean(found - self.before.scores, axis=0))
 
     def keep(self, member: int, amplitudes: Vector) -> None:
         """Keep the coordinates that these amplitudes of the responses mean, and what they make of the scores."""

@@ -328,8 +328,12 @@ def _same(scene: Scene, one: Choice, other: Choice) -> bool:
 
 
 def null_scores(analysis: Analysis, ask: Ask, chosen: tuple[str, ...] = ()) -> Matrix:
-    """Return :func:`scores` of SIMULATIONS simulations of the model, simulated or from the cache."""
-    run = analysis.run
+    """Return :func:`scores` of SIMULATIONS simulations of the model, simulated or from the cache.
+
+    They draw the nuisances of which maps cannot be rid.
+    """
+    pairs = zip(analysis.run.nuisances, analysis.nuisances, strict=True)
+    run = replace(analysis.run, nuisances=tuple(table for table, one in pairs if not one.subtractable))
     science = config.science(run, *(("nuisance",) if run.nuisances else ()))
     identity = [science | {"ensemble": {}}, SIMULATIONS, chosen, package_digest(f"mcsim.{name}" for name in CODE)]
     identity += [

@@ -70,6 +70,13 @@ class Nuisance:
     def _one_sided(self) -> bool:
         return self.effect.parametrization.sign != 0
 
+    @property
+    def subtractable(self) -> bool:
+        """Return True if maps can be rid of it: it is linear, of either sign, and nothing of it is random."""
+        how = self.effect.parametrization
+        random = how.stochastic or how.noise_alone or self.effect.noise is not Effect.noise
+        return not (random or how.mean_response or how.nonlinear or how.sign or self.parameter_widths)
+
     def at(self, coordinates: Vector, **parameters: float) -> Effect:
         """Return the effect at coordinates, shape (k,)."""
         own = self.effect.parametrization.nearest(coordinates, np.eye(len(coordinates)))

@@ -95,20 +95,23 @@ def test_an_unlisted_effect_is_described_written_and_shrinks(small, tmp_path, mo
         assert first.says in report.page(found)
 
 
-@pytest.mark.parametrize("nuisances", [(), ("calibration",)])
-def test_nothing_beside_nuisances_has_a_note(nuisances, monkeypatch):
-    """Nuisances are not fitted before the search: nothing found beside them is no finding."""
+@pytest.mark.parametrize("hiding", [[], ["noise level of V1"]])
+def test_nothing_beside_nuisances_has_a_note(hiding, monkeypatch):
+    """Of some nuisances maps cannot be rid: nothing found beside them is no finding."""
 
     @dataclass(frozen=True)
     class Result:
         notes: tuple[str, ...] = ("first",)
+        nuisances: tuple[()] = ()
         unlisted: tuple[()] | None = None
         unlisted_held_out: None = None
 
     for name, value in (("scene_for", None), ("search_of", None), ("structures_of", ((), None))):
         monkeypatch.setattr(unlisted, name, lambda *_, value=value: value)
-    run = SimpleNamespace(nuisances=nuisances)
-    analysis = SimpleNamespace(run=run, job=lambda _: None, settings=None)
+    nuisances = [SimpleNamespace(title="calibration of W1", subtractable=True)]
+    nuisances += [SimpleNamespace(title=title, subtractable=False) for title in hiding]
+    analysis = SimpleNamespace(run=None, nuisances=nuisances, job=lambda _: None, settings=None)
     found = unlisted.reconstructed(Result(), SimpleNamespace(context=SimpleNamespace(analysis=analysis)), None)
     assert found.unlisted == ()
-    assert found.notes == ("first", *((unlisted.HIDDEN,) if nuisances else ()))
+    notes = (unlisted.HIDDEN.format(" and ".join(hiding)),) if hiding else ()
+    assert found.notes == ("first", *notes)
