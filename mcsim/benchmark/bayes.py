@@ -91,12 +91,17 @@ def facts(drawn: Drawn, x: Vector, response: Vector, library: EffectsLibrary, ba
     """
     known: dict[Answer, float] = bayes.probabilities(x) if drawn.in_library else {}
     best, probability = max(known.items(), key=lambda item: item[1], default=(None, np.nan))
-    absent = [identity not in drawn.identities for identity in library.identities]
+    members, cosines = drawn.members, []
+    for member in members:
+        others = [identity != member.identity for identity in library.identities]
+        alone = response if len(members) == 1 else library.response([member])
+        cosines.append(float(np.max(library.cosines(alone)[others], initial=0.0)))
     return {
         "kind": drawn.kind,
         "truth": drawn.identities,
-        "columns": len(drawn.members[0].coordinates) if len(drawn.members) == 1 else 0,
-        "rival": float(np.max(library.cosines(response)[absent], initial=0.0)),
+        "columns": len(members[0].coordinates) if len(members) == 1 else 0,
+        "weakest": min((member.strength for member in members), default=0.0),
+        "rival": max(cosines, default=0.0),
         "distances": () if drawn.in_library else library.distances(response),
         "bayes": best,
         "bayes_right": probability,

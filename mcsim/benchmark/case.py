@@ -133,8 +133,10 @@ class Record:
     #: strength, columns: expected S/N of all effects together, and number of linear components of a single one
     strength: float
     columns: int
-    #: rival, distances: largest cosine of the response with a candidate that does not act, and the S/N that the best
-    #: one, two and three candidates, none of them acting, leave of the response
+    #: weakest, rival, distances: smallest expected S/N of an effect alone, the largest cosine of the response of one
+    #: alone with any other candidate, and the S/N that the best one, two and three candidates, none of them acting,
+    #: leave of the response
+    weakest: float
     rival: float
     distances: tuple[float, ...]
     #: p_value, maximum, verdict, answers: p-value of the global test, and of the most significant candidate alone,

@@ -127,13 +127,18 @@ def _naming(records: Sequence[Record]) -> list[Metric]:
     distinct = [r for r in ones if r.rival <= DISTINCT]
     between = [r.right for r in ones if DISTINCT < r.rival <= DEGENERATE]
     degenerate = [r.truth in r.answers for r in ones if r.rival > DEGENERATE]
+    pairs = [r for r in records if r.kind == "two"]
+    clear = [r for r in pairs if r.weakest >= NAMED and r.rival <= DISTINCT]
     single, several = f"right effect, S/N >= {NAMED:g}", f"truth in the set, S/N >= {NAMED:g}"
     return [
         share(f"{single}, |rho| <= {DISTINCT:g}", [r.right for r in distinct]).within("at least 95 %", 0.95),
         share(f"{single}, |rho| <= {DISTINCT:g}, Bayes", [r.bayes == r.truth for r in distinct]),
         share(f"{single}, {DISTINCT:g} < |rho| <= {DEGENERATE:g}", between),
         share(f"{several}, |rho| > {DEGENERATE:g}", degenerate).within("at least 95 %", 0.95),
-        share("truth in the set, two effects", [r.truth in r.answers for r in records if r.kind == "two"]),
+        share("truth in the set, two effects", [r.truth in r.answers for r in pairs]),
+        share(f"both of two effects, S/N >= {NAMED:g} each, |rho| <= {DISTINCT:g}", [r.right for r in clear]).within(
+            "at least 80 %", 0.8
+        ),
     ]
 
 

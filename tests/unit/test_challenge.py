@@ -310,7 +310,8 @@ def test_pulls_are_those_of_constrained_components():
 
 
 def record(kind="one", verdict="effect", there=(("beam_width", "A"),), said=((("beam_width", "A"),),), **changes):
-    values = {"strength": 9.0, "columns": 1, "rival": 0.2, "distances": (), "p_value": 0.001, "maximum": 0.001}
+    values = {"strength": 9.0, "columns": 1, "weakest": 9.0, "rival": 0.2, "distances": ()}
+    values |= {"p_value": 0.001, "maximum": 0.001}
     answers = tuple(frozenset(one) for one in said)
     values |= {"case": "case", "kind": kind, "truth": frozenset(there), "verdict": verdict, "answers": answers}
     return Record(**(values | changes))
@@ -328,6 +329,12 @@ def test_what_counts_as_right():
     ]
     assert [one.right for one in records] == [True, False, True, True, False, False]
     assert [one.wrong_name for one in records] == [False, True, False, False, True, False]
+    pair = {"there": (("beam_width", "A"), ("gain_drift", "B")), "said": ((("beam_width", "A"), ("gain_drift", "B")),)}
+    part = {**pair, "said": ((("beam_width", "A"),),)}
+    pairs = [record("two", **pair), record("two", **part), record("two", **part, weakest=4.0)]
+    pairs += [record("two", **part, rival=0.8)]
+    figures = {figure.name: figure for figure in Score("toy", [*records, *pairs]).metrics}
+    assert figures["both of two effects, S/N >= 5 each, |rho| <= 0.7"].value == 0.5
     figures = {figure.name: figure for figure in Score("toy", records).metrics}
     assert figures["right effect, S/N >= 5, |rho| <= 0.7"].value == 0.5
     assert figures["right effect, S/N >= 5, |rho| <= 0.7, Bayes"].value == 1.0
