@@ -5,7 +5,7 @@ frame (sky, scan, spacecraft, time), in one channel or all, and in the splits al
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -14,7 +14,6 @@ from scipy.linalg import block_diag
 from scipy.special import poch
 
 from mcsim.instrument.scan.model import SECONDS_PER_DAY
-from mcsim.reconstruction.forms import REFERENCE_GHZ
 from mcsim.reconstruction.scores import (
     ACTED_ON,
     ELONGATION,
@@ -54,9 +53,6 @@ ANY = f"1-{HARMONICS}"  #: of a wave in any way: a constant and all harmonics
 LOWEST = "degrees 0-1"  #: kind of a monopole and a dipole
 ALSO_COMMON = ("monopole", "dipole", LOWEST)
 """Patterns that all channels may have alike: in the sky itself, but skies of a model have none of them."""
-
-INDICES = (-3.0, -2.0, 1.5)
-"""Power of the frequency, in thermodynamic units, of signals of several channels: synchrotron, free-free, dust."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -425,17 +421,10 @@ def _modulations(scene: Scene) -> Iterator[Structure]:
 
 
 def _scaled(scene: Scene) -> Iterator[Structure]:
-    """Yield what is added to all channels in proportion to a power of the frequency, but to separated components.
-
-    Beside a map of these, what all others have alike is no part of the sky itself, and has the power 0.
-    """
-    channels = [c for c, there in enumerate(scene.foregrounds) if there]
-    frequencies = [scene.frequencies[c] for c in channels]
-    if None in frequencies or len(set(frequencies)) < 2:
-        return
-    views = tuple(i for i, view in enumerate(scene.views) if view.channel in channels)
-    ratios = np.array([(scene.frequencies[scene.views[i].channel] or REFERENCE_GHZ) / REFERENCE_GHZ for i in views])
-    for index in INDICES if all(scene.foregrounds) else (0.0, *INDICES):
+    """Yield what is added to all channels in proportion to a power of the frequency, but to separated components."""
+    for k, (index, scaling) in enumerate(scene.scalings.items()):
         for stage, acts_on, frame, kind, keys, mix in _added(scene):
-            own = None, ALIKE, index, _rows(scene, keys, views), ratios**index, mix, views, _tried(scene, kind)
-            yield Structure(stage, acts_on, frame, kind, *own)
+            rows, tried = _rows(scene, keys, scene.shared), _tried(scene, kind)
+            yield Structure(stage, acts_on, frame, kind, None, ALIKE, index, rows, scaling, mix, scene.shared, tried)
+        keys = [("summed", k, b) for b in range(len(scene.fine) - 1)]
+        yield replace(_plain(scene, "added", "sky", "power", None, keys), index=index)

@@ -19,7 +19,7 @@ from scipy.special import poch
 from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.reconstruction import sources
 from mcsim.reconstruction.choices import Choice
-from mcsim.reconstruction.forms import boosts, rotations
+from mcsim.reconstruction.forms import REFERENCE_GHZ, boosts, rotations
 from mcsim.reconstruction.periods import TimeLine
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
@@ -40,6 +40,8 @@ HARMONICS = 4  #: highest harmonic of spin phase, year and orientation that is s
 BINS = 4  #: ranges of degrees of a profile in l, equal in log l
 ACTED_ON = ("sky and dipole", "sky", "dipole")  #: what a wave multiplies, if it is not added
 PERIODIC = ("", ACTED_ON[0])  #: what a wave multiplies whose period is not known, or what steps or decays
+INDICES = (-3.0, -2.0, 1.5)
+"""Power of the frequency, in thermodynamic units, of signals of several channels: synchrotron, free-free, dust."""
 HISTORY = 16  #: equal parts of the survey's time, in which steps and decays are known
 ELSEWHERE = 32  #: highest degree of a signal from elsewhere: a lobe has as many orders, and what is finer averages out
 
@@ -116,6 +118,23 @@ class Scene:
         """Return the highest degree of patterns that are added."""
         return min(ADDED, self.lmax)
 
+    @cached_property
+    def shared(self) -> tuple[int, ...]:
+        """Return the maps that may have a signal by their frequencies; none if these are alike or not known."""
+        there = tuple(i for i, view in enumerate(self.views) if self.foregrounds[view.channel])
+        known = {self.frequencies[self.views[i].channel] for i in there}
+        return there if None not in known and len(known) > 1 else ()
+
+    @property
+    def scalings(self) -> dict[float, Vector]:
+        """Return how strong such a signal is in each of the maps that share it, by the power of the frequency.
+
+        Beside a map of separated components, what all others have alike is no part of the sky itself: the power 0.
+        """
+        known = [self.frequencies[self.views[i].channel] or REFERENCE_GHZ for i in self.shared]
+        indices = INDICES if all(self.foregrounds) else (0.0, *INDICES)
+        return {index: (np.array(known) / REFERENCE_GHZ) ** index for index in (indices if known else ())}
+
     def edges(self, first: int) -> tuple[int, ...]:
         """Return where ranges of degrees from ``first`` on start, and lmax + 1."""
         inner = np.geomspace(max(first, 2), self.lmax + 1, BINS + 1).round().astype(int)
@@ -159,7 +178,9 @@ class Scene:
         for channel in range(len(self.channels)):
             if len(self.of(channel)) > 1:
                 found += [(kind, channel, b) for kind in ("difference", "common") for b in range(len(self.fine) - 1)]
-        found += [("power", b) for b in range(len(self.fine) - 1)]
+        ranges = range(len(self.fine) - 1)
+        found += [("summed", k, b) for k in range(len(self.scalings)) for b in ranges]
+        found += [("power", b) for b in ranges]
         found += [("modulation", j) for j in range((MODULATION + 1) ** 2)] + [("boost", axis) for axis in range(3)]
         for i, view in enumerate(self.views):
             found += [*_keys_of(i, view.periods), *(("source", i, kind) for kind in view.sources)]
@@ -254,6 +275,10 @@ class Scene:
             if len(own := self.of(channel)) > 1:
                 a, b = filtered.adjoint[own[0]], filtered.adjoint[own[1]]
                 found += [self._powers(a - b, a - b), self._powers(a, b)]
+        for scaling in self.scalings.values():
+            each = ((i, f * filtered.adjoint[i]) for i, f in zip(self.shared, scaling, strict=True))
+            total = np.sum([alm_.multiply(one, self.views[i].response, self.lmax) for i, one in each], axis=0)
+            found.append(self._powers(total, total))
         return np.concatenate([*found, self._of_sky(filtered.sky)])
 
     def _lobe(self, r: Map, view: View) -> tuple[float, float]:

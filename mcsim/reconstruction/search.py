@@ -15,7 +15,8 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.reconstruction.grammar import ALIKE, ANY, INDICES, LOWEST, MEANS, Structure
+from mcsim.reconstruction.grammar import ALIKE, ANY, LOWEST, MEANS, Structure
+from mcsim.reconstruction.scores import INDICES
 from mcsim.sphere import real
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector, divided
@@ -164,6 +165,8 @@ class Search:
             if (rival := next(rivals, None)) is not None:  # is told first
                 near.insert(0, near.pop(near.index(rival)))
             found.append(Found(members[best], float(values.max()), p, float(falls[best]), tuple(near), rival))
+            if (own.stage, own.kind) == ("added", "power"):  # nobody knows what such a pattern leaves in other scores
+                break
             chosen = [one.structure for one in found]
             if sky is not None:
                 sky.keep(members[best], amplitudes[best])
@@ -332,15 +335,20 @@ class Search:
         structure = self.grammar[member]
         if not structure.of_variances:
             return 1.0
+        modes = np.ones(1)
         if structure.kind in ("power", "spectrum"):
             rows, x = (self._squares(structure, one) for one in (self.simulations, scores))
-            a = x / rows.mean(axis=0) - 1.0
+            a, modes = x / rows.mean(axis=0) - 1.0, rows.mean(axis=0) ** 2 / rows.var(axis=0)
+            if structure.stage == "added" and np.sum(modes * a) < 0.0:  # what is added has no power below zero
+                return 0.0
         else:
             ((theta, _),) = self.fit([structure], scores)
             pattern = theta if structure.mix is None else structure.mix.T @ theta
             a = real.field(np.asarray(pattern), *healpy.pix2vec(COARSE, np.arange(12 * COARSE**2)))
         a = np.maximum(a, LARGEST_FALL)
-        return float(2.0 * np.sum(a - np.log1p(a)) / np.sum(a**2)) if np.any(np.abs(a) > TINY) else 1.0
+        if not np.any(np.abs(a) > TINY):
+            return 1.0
+        return float(2.0 * np.sum(modes * (a - np.log1p(a))) / np.sum(modes * a**2))
 
     def _squares(self, structure: Structure, scores: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums of squares whose relative change powers are, from scores (..., P).
@@ -349,7 +357,7 @@ class Search:
         the filter has taken the sky out of their sum; more of it is in the first part alone.
         """
         found = structure.of(scores)
-        if structure.stage != "added":
+        if structure.stage != "added" or structure.channel is None:
             return found
         own = (one for one in self.grammar if (one.kind, one.channel) == ("spectrum", structure.channel))
         return found + 0.25 * next(own).of(scores)
