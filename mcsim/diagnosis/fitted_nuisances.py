@@ -9,7 +9,6 @@ u - t G (u - <u0>) nuisances are marginalised, and what a structure makes of its
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import healpy
 import numpy as np
@@ -25,7 +24,7 @@ from mcsim.reconstruction.scores import Scene
 from mcsim.reconstruction.search import SMALL, Search
 from mcsim.reconstruction.simulated_scores import SEED, scores_of_maps
 from mcsim.simulation.channels import table_of
-from mcsim.simulation.nuisance import Nuisance, draws
+from mcsim.simulation.nuisance import REACH, Nuisance, draws
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Map, Matrix, Vector
 
@@ -58,7 +57,10 @@ class Marginal:
 
 @dataclass(frozen=True, eq=False)
 class FittedNuisances:
-    """The nuisances of a model that can be taken from observed maps, with what the data say of them."""
+    """The nuisances of a model that can be taken from observed maps, with what the data say of them.
+
+    What is missing may look like a nuisance of any size: beyond REACH prior widths it is not taken for one.
+    """
 
     data: ObservedMaps
     nuisances: tuple[Nuisance, ...]
@@ -71,16 +73,14 @@ class FittedNuisances:
         every = data.context.analysis.nuisances
         kept = np.repeat([one.subtractable for one in every], [len(one.widths) for one in every]).astype(bool)
         values = np.array([[one.amplitude, one.sigma] for one in found]).reshape(-1, 2)[kept]
-        return cls(data, tuple(one for one in every if one.subtractable), *values.T)
+        own = tuple(one for one in every if one.subtractable)
+        most = REACH * _widths(own)
+        return cls(data, own, np.clip(values[:, 0], -most, most), values[:, 1])
 
     @property
     def z(self) -> Vector:
         """Return the fitted coordinates less their prior mean, in prior widths, shape (k,)."""
-        return self.fitted / self._widths
-
-    @cached_property
-    def _widths(self) -> Vector:
-        return np.concatenate([np.zeros(0), *(one.sigma for one in self.nuisances)])
+        return self.fitted / _widths(self.nuisances)
 
     @property
     def maps(self) -> ObservedMaps:
@@ -105,7 +105,7 @@ class FittedNuisances:
     def drawn(self, count: int) -> Matrix:
         """Return draws of the nuisances in prior widths, shape (count, k)."""
         found = np.stack([draws(self.nuisances, SEED, realization)[0] for realization in range(count)])
-        return np.asarray(found / self._widths)
+        return np.asarray(found / _widths(self.nuisances))
 
     def marginal(self, search: Search, scene: Scene) -> Marginal:
         """Return what takes the nuisances out of scores; ``search`` has those of a model without them."""
@@ -119,7 +119,7 @@ class FittedNuisances:
 
         none = scores([])
         changes = np.stack([scores(self._tables(step)) - none for step in steps])
-        responses = changes * (self._widths / self.errors)[:, None]
+        responses = changes * (_widths(self.nuisances) / self.errors)[:, None]
         members = tuple(search.grammar[k] for k in dict.fromkeys(_telling(search, row) for row in responses))
         own = np.concatenate([one.of(search.simulations) for one in members], axis=-1)
         null = SimulatedGaussian.from_simulations(own, floor=SMALL)
@@ -134,9 +134,14 @@ class FittedNuisances:
         return replace(search, simulations=marginal.of(search.simulations, self.drawn(len(search.simulations))))
 
 
+def _widths(nuisances: Sequence[Nuisance]) -> Vector:
+    """Return the prior standard deviation of every coordinate, shape (k,)."""
+    return np.concatenate([np.zeros(0), *(one.sigma for one in nuisances)])
+
+
 def _telling(search: Search, response: Vector) -> int:
     """Return the structure of fewest coordinates whose scores tell all of a nuisance but a share of 1 - ENOUGH."""
-    told = np.zeros(len(search.grammar))
+    told = np.full(len(search.grammar), -1.0)
     for k, (structure, null) in enumerate(zip(search.grammar, search.nulls, strict=True)):
         if null is not None and not structure.of_variances:
             told[k] = null.hartlap_factor * np.sum((null.whitening @ structure.of(response)) ** 2)

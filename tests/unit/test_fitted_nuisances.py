@@ -56,7 +56,7 @@ def test_which_nuisances_are_taken_from_maps():
     found = nuisances_of(run, systematics.catalogue())
     assert [one.effect.name for one in found if one.subtractable] == ["calibration", "pointing_offset"]
     data = SimpleNamespace(context=SimpleNamespace(analysis=SimpleNamespace(nuisances=found)))
-    results = [SimpleNamespace(amplitude=float(k), sigma=0.5) for k in range(5)]
+    results = [SimpleNamespace(amplitude=amplitude, sigma=0.5) for amplitude in (-0.5, 1.0, 2.0, 3.0, 4.0)]
     known = FittedNuisances.of(data, results)
-    assert known.fitted.tolist() == [0.0, 2.0, 3.0]
-    assert known.z == pytest.approx([0.0, 2.0 / 5.0, 3.0 / 5.0])
+    assert known.fitted == pytest.approx([-0.008, 2.0, 3.0])  # calibrations to four prior widths at most
+    assert known.z == pytest.approx([-4.0, 2.0 / 5.0, 3.0 / 5.0])
