@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 
 import healpy
 import numpy as np
@@ -11,6 +12,7 @@ from mcsim import config
 from mcsim.datavector.analysis import simulated_maps
 from mcsim.datavector.campaign import Ask, constrained_jobs
 from mcsim.datavector.halves import Halves
+from mcsim.datavector.wiener_filter import sky_variance
 from mcsim.diagnosis.fitted_nuisances import FittedNuisances, Marginal
 from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.observed_maps import ObservedMaps
@@ -77,6 +79,8 @@ def structures_of(
     rows = []
     for one, structure, (theta, covariance), effect in zip(found, chosen, fits, plugins, strict=True):
         size, where, picture = (None, "", np.zeros(0)) if effect is None else made.picture(structure, effect)
+        if structure.of_a_foreground:
+            size = rms_of_powers(structure, theta, scene)
         says = words.says(structure, theta, scene)
         others = [search.grammar[k] for k in one.alternatives[:ALTERNATIVES]]
         told = tuple(words.says(other, search.fit([other], x)[0][0], scene) for other in others)
@@ -101,6 +105,15 @@ def structures_of(
             )
         )
     return tuple(rows), made.reduction(chosen, plugins)
+
+
+def rms_of_powers(structure: Structure, theta: Vector, scene: Scene) -> float:
+    """Return the rms of a pattern that is known by its power at 94 GHz alone, uK, as the maps see it that have it."""
+    cl, scaling = np.zeros(scene.lmax + 1), scene.scalings[structure.index or 0.0]
+    for (low, high), power in zip(pairwise(scene.fine), theta, strict=True):
+        cl[low:high] = max(float(power), 0.0)
+    seen = [f**2 * sky_variance(cl, scene.views[i].response) for i, f in zip(scene.shared, scaling, strict=True)]
+    return float(np.sqrt(np.mean(seen)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,7 +41,8 @@ def structure_figure(found: Reconstructed, frame: str) -> Figure | None:
         axes.set_xticks(ticks, list(map(str, ticks)))
         axes.minorticks_off()
         axes.set_xlabel("ℓ", fontsize=9)
-        axes.set_ylabel(PROFILE.get(found.stage, "power of the signal"), fontsize=9)
+        signal = "power of the signal" if found.index is None else "$C_\\ell$ at 94 GHz, µK²"
+        axes.set_ylabel(PROFILE.get(found.stage, signal), fontsize=9)
         axes.spines[["top", "right"]].set_visible(False)
     return figure
 

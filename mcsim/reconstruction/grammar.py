@@ -143,6 +143,11 @@ class Structure:
         return self.stage == "noise" or self.kind == "power"
 
     @property
+    def of_a_foreground(self) -> bool:
+        """Return True for the power of a pattern that channels share by their frequencies."""
+        return self.kind == "power" and self.index is not None
+
+    @property
     def leaves_low(self) -> bool:
         """Return True if the scores leave out monopoles and dipoles that the structure makes."""
         return self.stage == "modulation" or (self.stage, self.acts_on) == ("gain", "sky")

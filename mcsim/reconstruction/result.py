@@ -28,7 +28,8 @@ class Reconstructed:
     pvalue: float
     delta_chi2: float
     coordinates: int  #: number of numbers that describe it
-    rms_uk: float | None  #: of what it adds to the maps that it acts in, uK; None if no effect can be like it
+    #: of what it adds to the maps that it acts in, uK, of a foreground by its power; None if no effect can be like it
+    rms_uk: float | None
     relative_error: float  #: of its amplitude, which for noise is that of a variance
     cause: str  #: A known effect that makes such structures, with its reference; "" if none
     alternatives: tuple[str, ...]  #: structures that are less probable by a factor of 20 at most, in plain words
@@ -48,7 +49,7 @@ class Reconstructed:
         text = self.says[:1].upper() + self.says[1:]
         size = ""
         if self.rms_uk is not None:
-            root = 0.5 if self.stage == "noise" else 1.0  # its amplitude is that of a variance
+            root = 0.5 if self.stage == "noise" or self.kind == "power" else 1.0  # its amplitude is that of a variance
             size = f": {measured(self.rms_uk, root * self.rms_uk * self.relative_error, ' µK')} rms"
         other = "" if self.rival is None else f"; or, as probable within a factor of 4, it {self.rival['says']}"
         return f"{text}{other}{size} ({p_equals(self.pvalue)})."

@@ -278,7 +278,7 @@ class Scene:
         for scaling in self.scalings.values():
             each = ((i, f * filtered.adjoint[i]) for i, f in zip(self.shared, scaling, strict=True))
             total = np.sum([alm_.multiply(one, self.views[i].response, self.lmax) for i, one in each], axis=0)
-            found.append(self._powers(total, total))
+            found.append(0.5 * self._powers(total, total))
         return np.concatenate([*found, self._of_sky(filtered.sky)])
 
     def _lobe(self, r: Map, view: View) -> tuple[float, float]:

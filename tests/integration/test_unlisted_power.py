@@ -34,10 +34,11 @@ def test_the_power_of_a_foreground_is_found_with_its_index(drawn, index, rms_uk)
     """With the power of the frequency, in all channels, falling with the degree; and nothing follows it."""
     small = learned_small()
     data = data_of(small.run)
-    maps = list(simulate.maps(data, 3))
+    maps, added = list(simulate.maps(data, 3)), []
     for number, channel in enumerate(data.channels):
         seen = healpy.alm2map(healpy.almxfl(drawn, channel.response.factors[0].real), NSIDE)
         scale = (channel.site.frequency_ghz / 94.0) ** index * rms_uk / np.std(seen)
+        added.append(scale * seen)
         maps[2 * number : 2 * number + 2] = [one + scale * seen for one in maps[2 * number : 2 * number + 2]]
     observed = ObservedMaps(small, maps, ask)
     found = unlisted.reconstructed(diagnose_data(observed, "pattern"), observed, scored)
@@ -47,6 +48,8 @@ def test_the_power_of_a_foreground_is_found_with_its_index(drawn, index, rms_uk)
     assert first.pvalue < 1e-4
     assert "residual foreground" in first.cause
     assert found.unlisted_held_out is None
+    # The power of a range is that of its degrees by their S/N, which falls.
+    assert first.rms_uk == pytest.approx(np.std(added), rel=0.15)
     sizes = [size for *_, size, _ in first.profile]
     assert sizes[0] > sizes[1] > 0.0
     assert first.profile[0][:2] == (FIRST, 12)
