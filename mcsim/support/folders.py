@@ -22,12 +22,21 @@ def user_path(given: Any) -> Path:
         raise InputError(f"{shown} is no path of a file or folder ({error}); give one.") from None
 
 
+def real_path(path: Path) -> Path:
+    """Return what a symbolic link leads to, and any other path as it is.
+
+    What is renamed to a link takes no place, and what is made beside one may be on another disk.
+    """
+    return Path(os.path.realpath(path)) if os.path.islink(path) else path
+
+
 @contextmanager
 def appearing(path: Path) -> Iterator[Path]:
     """Yield a scratch folder beside ``path``; rename it to ``path`` at the end, delete it if the block fails.
 
     If another process was faster, its folder stays.
     """
+    path = real_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:

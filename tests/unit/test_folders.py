@@ -38,6 +38,16 @@ def test_who_was_quicker_stays(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
 
 
+def test_what_is_made_behind_a_link_is_there(tmp_path):
+    (tmp_path / "disk" / "folder").mkdir(parents=True)
+    (tmp_path / "link").symlink_to(tmp_path / "disk" / "folder")
+    with appearing(tmp_path / "link") as scratch:
+        assert scratch.parent == tmp_path / "disk"  # from where it can be renamed
+        (scratch / "file").write_text("all")
+    assert (tmp_path / "disk" / "folder" / "file").read_text() == "all"
+    assert (tmp_path / "link").is_symlink()
+
+
 def test_a_file_in_the_way_is_an_error(tmp_path):
     (tmp_path / "folder").write_text("in the way")
     with pytest.raises(NotADirectoryError), appearing(tmp_path / "folder"):
