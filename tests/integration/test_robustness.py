@@ -44,6 +44,24 @@ def test_second_writer_is_refused_by_name(small_store: Path, client: Client, tmp
     assert lock.exists()
 
 
+def test_a_store_behind_a_link_is_that_store(
+    small_store: Path, short_store: Path, client: Client, tmp_path: Path
+) -> None:
+    """A link may lead to another disk, from which nothing can be renamed, and others may use the store itself."""
+    real, link = tmp_path / "disk" / "x.zarr", tmp_path / "link.zarr"
+    shutil.copytree(short_store, real)
+    link.symlink_to(real)
+    with locked(real), refused("x.zarr", os.getpid(), socket.gethostname()):
+        runner.run(table(), link, workers=client)
+    runner.run(table(), link, workers=client)
+    assert_same(real, small_store)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["disk", "link.zarr"]  # scratch files and log are beside it
+    link.unlink()
+    link.symlink_to(tmp_path / "disk" / "merged.zarr")
+    runner.merge([small_store], link)
+    assert_same(tmp_path / "disk" / "merged.zarr", small_store)
+
+
 def test_lock_of_a_dead_process_is_taken_over(small_store: Path, client: Client, tmp_path: Path) -> None:
     dead = subprocess.run(
         [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True, check=True

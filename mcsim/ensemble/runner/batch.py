@@ -21,7 +21,7 @@ from mcsim.simulation.channels import check_effects
 from mcsim.simulation.survey import Survey, survey
 from mcsim.stats import streaming
 from mcsim.stats.streaming import Sums
-from mcsim.support.folders import user_path
+from mcsim.support.folders import real_path, user_path
 from mcsim.support.progress import Journal, reporting
 
 
@@ -95,7 +95,8 @@ def run(
         check_workers(workers)
     loaded = config.load(source)
     wanted = plan.wanted(loaded, realizations)
-    target = user_path(path) if path is not None else plan.default_store(loaded, realizations)
+    # Of a store behind a link, lock, log and scratch files belong beside the store itself.
+    target = real_path(user_path(path) if path is not None else plan.default_store(loaded, realizations))
     exists = plan.exists(target)
     if resume and not exists:
         raise InputError(f"There is no store {target} to resume; leave out --resume to start it.")

@@ -13,7 +13,7 @@ from mcsim.ensemble import opening, plan, store, summary
 from mcsim.ensemble.runner.batch import Result
 from mcsim.ensemble.tasks import empty, summarise_node
 from mcsim.errors import InputError, RunError
-from mcsim.support.folders import is_full, user_path
+from mcsim.support.folders import is_full, real_path, user_path
 from mcsim.support.progress import reporting
 
 
@@ -51,7 +51,7 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     if not isinstance(paths, str | Path | Iterable):
         raise InputError(f"paths is {paths!r}, but it must be a list of stores.")
     sources = [user_path(p) for p in ([paths] if isinstance(paths, str | Path) else paths)]
-    target = user_path(path)
+    target = real_path(user_path(path))
     if not sources:
         raise InputError("There is nothing to merge; name the stores of the slices.")
     if target.exists():
