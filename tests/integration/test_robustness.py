@@ -137,6 +137,24 @@ def test_merge_of_a_short_and_a_long_ensemble_is_the_long_one(
     assert attributes["configuration"] == store.attributes(small_store)["configuration"]
 
 
+def test_two_merges_into_one_store_are_refused_by_name(
+    small_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "merged.zarr"
+    with locked(path), refused("merged.zarr", os.getpid(), socket.gethostname()):
+        runner.merge([small_store], path)
+    real = store.check_writable
+
+    def overtaken(target: Path) -> Path:
+        shutil.copytree(small_store, target)
+        return real(target)
+
+    monkeypatch.setattr(store, "check_writable", overtaken)
+    with refused("merged.zarr"):
+        runner.merge([small_store], path)
+    assert [p.name for p in tmp_path.iterdir()] == ["merged.zarr"]
+
+
 def test_merge_on_a_full_disk_names_the_store_to_make(
     small_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

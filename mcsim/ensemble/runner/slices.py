@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.ensemble import opening, plan, store, summary
+from mcsim.ensemble.lock import locked
 from mcsim.ensemble.runner.batch import Result
 from mcsim.ensemble.tasks import empty, summarise_node
 from mcsim.errors import InputError, RunError
@@ -54,8 +55,7 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     target = real_path(user_path(path))
     if not sources:
         raise InputError("There is nothing to merge; name the stores of the slices.")
-    if target.exists():
-        raise InputError(f"{target} exists already; merge into a new folder.")
+    _check_new(target)
     first = store.attributes(sources[0])
     for other in sources[1:]:
         plan.check_mergeable(sources[0], first, other, store.attributes(other))
@@ -63,7 +63,12 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     layout = opening.layout(sources[0], size)
     first["configuration"]["ensemble"]["realizations"] = size
     place = store.check_writable(target)
-    with _disk_named(target), tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=place) as folder:
+    with (
+        _disk_named(target),
+        locked(target),
+        tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=place) as folder,
+    ):
+        _check_new(target)  # once more: another one may have ended just before
         scratch = Path(folder) / "merged"
         store.create(scratch, layout, first)
         there = np.zeros(size, dtype=bool)
@@ -81,6 +86,11 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(scratch, target)
     return Result(target, int(store.done(target).sum()), 0, (), summarised=total is not None)
+
+
+def _check_new(target: Path) -> None:
+    if target.exists():
+        raise InputError(f"{target} exists already; merge into a new folder.")
 
 
 @contextmanager
