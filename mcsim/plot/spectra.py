@@ -29,8 +29,8 @@ def ensemble_figure(
 
     ``path``: store with a summary. ``L``, ``M``, ``d``: draw only these; by default one panel for every L > 0 and M (L
     = 0 if there is no other). ``pair``: label of the pair; by default the first. ``prediction``: prediction by
-    :func:`mcsim.predict`, drawn as dashed lines. Raise InputError if the selection is empty, or the prediction lacks
-    the pair or a mode.
+    :func:`mcsim.predict`, drawn as dashed lines. Raise InputError if the selection is empty, or the prediction is in
+    another frame or lacks the pair or a mode.
     """
     with opening.open_summary(path) as summary:
         pairs = [str(label) for label in summary["pair"].values]
@@ -58,6 +58,9 @@ def ensemble_figure(
 
 def _matching(prediction: xr.Dataset, pair: str, modes: xr.Dataset) -> xr.Dataset:
     """Return the same pair and modes of a prediction."""
+    own, other = (one.attrs.get("frame") for one in (modes, prediction))
+    if None not in (own, other) and own != other:
+        raise InputError(f"the ensemble is in the {own} frame, the prediction in the {other} one; predict in the same.")
     for dim, wanted in (("pair", [pair]), ("mode", modes["mode"].values.tolist())):
         there = prediction[dim].values.tolist()
         if lacking := [name for name in wanted if name not in there]:

@@ -26,7 +26,7 @@ from mcsim.ensemble import runner, tables
 from mcsim.ensemble.maps import write_map
 from mcsim.ensemble.prediction import predict
 from mcsim.plot.spectra import ensemble_figure
-from refusals import unnamed
+from refusals import refused, unnamed
 
 from .conftest import SMALL, Command, assert_refused, table
 
@@ -118,6 +118,12 @@ def test_notes_of_a_wide_and_a_narrow_figure_are_whole(small_store: Path, chosen
     box, whole = figure.get_tightbbox(), figure.bbox_inches
     assert box.x0 >= 0.0
     assert box.x1 <= whole.x1
+
+
+def test_a_prediction_in_another_frame_is_not_drawn(small_store: Path) -> None:
+    other = predict(table(map={"nside": 16, "frame": "galactic"}))
+    with refused("ecliptic", "galactic"):
+        ensemble_figure(small_store, prediction=other)
 
 
 def test_a_signal_is_not_hidden_by_the_mean_field_of_noise(small_store: Path, tmp_path: Path) -> None:
