@@ -107,6 +107,8 @@ def _frame(axes: Axes, modes: xr.Dataset) -> None:
     """Let the axes show the points where these differ from zero and the bands would dwarf them."""
     values = modes["biposh_difference_binned_mean"].values
     error = modes["biposh_difference_binned_standard_error"].values
+    if not np.isfinite(error).any():  # of one realization: there are no bands
+        return
     parts = np.stack([values.real, values.imag])
     low, high = min(0.0, float(np.nanmin(parts - error))), max(0.0, float(np.nanmax(parts + error)))
     bottom, top = axes.get_ylim()

@@ -120,6 +120,12 @@ def test_notes_of_a_wide_and_a_narrow_figure_are_whole(small_store: Path, chosen
     assert box.x1 <= whole.x1
 
 
+def test_one_realization_is_drawn_without_errors(client: Client, tmp_path: Path) -> None:
+    runner.run(table(ensemble={"realizations": 1}), tmp_path / "one.zarr", workers=client)
+    [axes] = ensemble_figure(tmp_path / "one.zarr", L=2, M=0, d=0).axes
+    assert np.isfinite(np.asarray(axes.lines[0].get_ydata(), float)).all()
+
+
 def test_a_prediction_in_another_frame_is_not_drawn(small_store: Path) -> None:
     other = predict(table(map={"nside": 16, "frame": "galactic"}))
     with refused("ecliptic", "galactic"):
