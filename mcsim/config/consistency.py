@@ -39,6 +39,11 @@ def check_rings(run: Any) -> None:
                 f'map.frame = "{run.map.frame}", but with grid = "gl" the limit of a scan depends on '
                 f'ecliptic colatitude alone; set frame = "ecliptic" {remedy}'
             )
+        if getattr(channel.scan, "sample_period_s", None) is not None:
+            raise ValueError(
+                f"channel[{channel.name}].scan.sample_period_s = {channel.scan.sample_period_s:g}, but with "
+                f'grid = "gl" a scan is its limit of endless time, without samples; remove it {remedy}'
+            )
         if not is_noise_free(channel.noise):
             raise ValueError(
                 f'channel[{channel.name}].{in_words(channel.noise)}, but grid = "gl" has no pixels to draw noise in; '

@@ -198,6 +198,10 @@ LIMIT = channel({"kind": "hit_averaged", "model": "wmap"})
         ({"map": {"grid": "gl", "splits": ["a", "b"]}}, ("map", "splits", "grid")),
         ({"map": {"grid": "gl", "pixel_window": "computed"}}, ("map", "pixel_window", "grid")),
         ({"map": {"grid": "gl", "frame": "galactic"}}, ("map.frame", "galactic", "ecliptic", "map.grid")),
+        (
+            {"channel": [channel({"kind": "hit_averaged", "model": "wmap", "sample_period_s": 5.0})]},
+            ("channel[W1].scan.sample_period_s", 5.0, "map.grid"),
+        ),
         ({"channel": [LIMIT | {"noise": {"sigma0_uk": 1.0}}]}, ("channel[W1].noise.sigma0_uk", 1)),
         (
             {"channel": [channel({"kind": "differencing", "model": "wmap", "pair": "WMAP"})]},
