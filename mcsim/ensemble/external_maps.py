@@ -236,6 +236,14 @@ def _zarr(path: str) -> Any:
 def _checked_stack(found: Any, where: str) -> Any:
     if "realization" not in found.sizes:
         raise InputError(f"{where} has the dimensions {', '.join(map(str, found.sizes))}; name one realization.")
+    done = getattr(found, "data_vars", {}).get("done")
+    if done is not None and done.dims == ("realization",):  # of a store of mcsim run
+        unfinished = np.flatnonzero(~done.values.astype(bool))
+        if unfinished.size:
+            raise InputError(
+                f"{where} has {unfinished.size} realizations that are not finished, {unfinished[0]} among them; finish "
+                "it with mcsim run, or give the others in Python, as xarray selects them by their variable done."
+            )
     return found
 
 

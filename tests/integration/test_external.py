@@ -134,6 +134,24 @@ def test_the_same_maps_stored_elsewhere_give_the_verdict_of_the_run(tmp_path):
         assert found.agreement.effects == ()
 
 
+def test_a_store_that_is_not_finished_is_no_model(tmp_path: Path) -> None:
+    stack = xr.Dataset(
+        {"observed_map": (("realization", "map_name", "pixel"), np.ones((4, 2, 12 * 8**2), dtype=np.float32))},
+        coords={"map_name": np.array(["V:a", "V:b"], dtype=object)},
+    )
+    run = config.load(MODEL)
+    for done in ([True] * 4, [True, True, False, True]):
+        own = stack.assign(done=("realization", done))
+        own.to_zarr(tmp_path / f"{sum(done)}.zarr", consolidated=False)
+        if all(done):
+            assert source_of(run, tmp_path / "4.zarr").count == source_of(run, own).count == 4
+            continue
+        with refused(tmp_path / "3.zarr", 1, 2):
+            assert source_of(run, tmp_path / "3.zarr").count
+        with refused(1, 2):
+            source_of(run, own)
+
+
 def test_the_default_route_as_a_function_gives_the_statistics_of_the_run():
     """Other seeds, so other skies: mean, scatter and test agree within their errors."""
     run = config.load(MODEL)
