@@ -47,7 +47,7 @@ class Expansion:
         self.smooth = functions[0] @ weight
         self.means = {n: float(weight @ rho**n) for n in range(2, order + 1, 2)}
         self.windows: dict[tuple[int, int], NDArray[np.float64]] = {}
-        for s in range(order + 1):
+        for s in range(min(order, lmax) + 1):  # sY_lm begins at l = s
             powers = [n for n in range(s, order + 1, 2) if n]
             wanted = functions[s] - self.smooth[:, None] if s == 0 else functions[s]
             columns = np.stack([rho**n - (self.means[n] if s == 0 else 0.0) for n in powers])

@@ -85,6 +85,14 @@ def test_error_falls_with_the_next_power_of_the_offsets(sky, order, tmp_path) ->
     assert np.all(np.abs(falls - (order + 1)) < 0.3)
 
 
+@pytest.mark.parametrize("lmax", [2, 3])
+def test_a_sky_of_fewer_degrees_than_powers_is_one_of_more(lmax, sky, tmp_path) -> None:
+    own, moments = alm_.resize(sky, LMAX, lmax), moments_of(scattered(1.0), 4, tmp_path)
+    [found] = offset_maps(own, expansion(NSIDE, lmax, 4), [moments])
+    [expected] = offset_maps(alm_.resize(own, lmax, LMAX), expansion(NSIDE, LMAX, 4), [moments])
+    np.testing.assert_allclose(found, expected, atol=1e-12 * np.std(expected))
+
+
 def test_samples_at_the_centres_need_nothing(sky) -> None:
     terms = expansion(NSIDE, LMAX, 4, spread=0.0)
     np.testing.assert_allclose(terms.smooth, 1.0, rtol=1e-12)
