@@ -11,6 +11,7 @@ import numpy as np
 
 from mcsim import config, systematics
 from mcsim.config.messages import standing
+from mcsim.config.noise import is_noise_free
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
 from mcsim.instrument.beams.coefficients import power_by_order
@@ -170,8 +171,21 @@ def check_effects(run: config.RunConfig) -> None:
                 refuse_excess(spec.name, acting)
             else:
                 refuse_differences(spec.name, acting)
+            _refuse_noise(run, spec, acting)
             site = site_of(run, spec)
             _warn_of_orders(run, spec, systematics.tried(acting, site), site.beam)
+
+
+def _refuse_noise(run: config.RunConfig, spec: config.Channel, acting: tuple[systematics.Effect, ...]) -> None:
+    """Refuse effects on noise alone in a channel that has none."""
+    if not all(is_noise_free(spec.noise_of(split)) for split in run.map.each_split):
+        return
+    for effect in acting:
+        if effect.amplitude != 0.0 and effect.parametrization.noise_alone:
+            raise InputError(
+                f"effect {effect.name} on channel {spec.name} acts on noise, but the channel has none; remove it, or "
+                "give the channel noise."
+            )
 
 
 def _warn_of_orders(run: config.RunConfig, spec: config.Channel, beam: beams.Beam, fiducial: beams.Beam) -> None:

@@ -273,6 +273,8 @@ def test_orders_that_a_file_of_moments_lacks_are_warned_of(smax, warned, tmp_pat
         ({"name": "foreground_residual", "amplitude": 1.0, "spectral_index": -1e4}, ("spectral_index", -1e4, 50.0)),
         ({"name": "transmission_imbalance", "channel": "W", "amplitude": 0.01}, ("transmission_imbalance", "W")),
         ({"name": "mapmaking_convergence", "channel": "W", "amplitude": 5.0}, ("mapmaking_convergence", "W")),
+        ({"name": "noise_level", "channel": "W", "amplitude": 0.1}, ("noise_level", "W")),
+        ({"name": "noise_anisotropy", "channel": "W", "amplitude": 0.1}, ("noise_anisotropy", "W")),
     ],
 )
 def test_an_effect_that_cannot_be_is_refused_before_a_store_is_made(effect, named, tmp_path: Path) -> None:
