@@ -1,8 +1,10 @@
 """Binned spectra as tables: the most significant ones, to files and from files."""
 
 import json
+import os
 import warnings
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
@@ -82,20 +84,30 @@ def check_output(output: str | Path) -> None:
 
 
 def write(summary: xr.Dataset, output: str | Path) -> None:
-    """Write a summary or a prediction as Zarr (``.zarr``) or NetCDF (``.nc``), or its binned spectra (``.ecsv``)."""
+    """Write a summary or a prediction as Zarr (``.zarr``) or NetCDF (``.nc``), or its binned spectra (``.ecsv``).
+
+    What is named ``output`` is complete, or is not there.
+    """
     check_output(output)
     target = user_path(output)
     with unwritable(target, "choose another file"):
         target.parent.mkdir(parents=True, exist_ok=True)
-        if target.suffix == ".zarr":
-            with warnings.catch_warnings():
-                # Zarr warns that its consolidated metadata and strings are not yet standard.
-                warnings.simplefilter("ignore", category=UserWarning)
-                summary.to_zarr(target, zarr_format=3, consolidated=True)
-        elif target.suffix == ".nc":
-            _for_netcdf(summary).to_netcdf(target, engine="scipy")
-        else:
-            table(summary).write(target, format="ascii.ecsv", overwrite=True)
+        with TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
+            scratch = Path(folder) / target.name
+            _write(summary, scratch)
+            os.replace(scratch, target)
+
+
+def _write(summary: xr.Dataset, target: Path) -> None:
+    if target.suffix == ".zarr":
+        with warnings.catch_warnings():
+            # Zarr warns that its consolidated metadata and strings are not yet standard.
+            warnings.simplefilter("ignore", category=UserWarning)
+            summary.to_zarr(target, zarr_format=3, consolidated=True)
+    elif target.suffix == ".nc":
+        _for_netcdf(summary).to_netcdf(target, engine="scipy")
+    else:
+        table(summary).write(target, format="ascii.ecsv")
 
 
 def _for_netcdf(summary: xr.Dataset) -> xr.Dataset:

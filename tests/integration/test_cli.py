@@ -1,10 +1,12 @@
 """The command line as a user meets it: outputs, exit codes, pictures and tables."""
 
+import errno
 import inspect
 import io
 import json
 import os
 import re
+import resource
 import shutil
 import subprocess
 import sys
@@ -109,6 +111,22 @@ scan = { kind = "hit_averaged", model = "wmap", sample_period_s = 157.8, line_of
     first, whole = (mcsim("diagnose", "small.toml", "data", "--dry-run", *more)[1] for more in (["--quick"], []))
     assert int(first.split("at most ")[1].split()[0]) < int(whole.split("at most ")[1].split()[0])
     assert_refused(mcsim("diagnose", "small.toml", "data"), "-o")
+
+
+@pytest.mark.parametrize("name", ["x.nc", "x.ecsv", "x.zarr"])
+def test_an_export_is_written_whole_or_not_at_all(name: str, small_store: Path, tmp_path: Path) -> None:
+    with open_summary(small_store) as summary:
+        whole = summary.load()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))  # as a disk that is full in the middle of a file
+    try:
+        with refused(name, errno=errno.EFBIG):
+            tables.write(whole, tmp_path / name)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
+    tables.write(whole, tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 @pytest.mark.parametrize("chosen", [{}, {"L": 2, "M": 0}])
