@@ -51,8 +51,8 @@ class Map:
 
     ``grid``: "healpix", or "gl": Gauss quadrature on rings, several times faster and exact, for surveys whose
     orientation moments depend on colatitude alone. These are parallel transport, and the exact long-time limit of a
-    scan model (``hit_averaged`` then means it) in the ecliptic frame. It has no pixels, so no ``nside``, mask, splits
-    or noise.
+    scan model (``hit_averaged`` then means it) in the ecliptic frame. It has no pixels, so no ``nside``, mask, splits,
+    noise or ``sample_period_s``.
     ``pixel_window``: "computed", "none" or a FITS file; default: "computed" for scans whose samples spread over the
     pixels, "none" for parallel transport, whose samples are at the centres.
     ``mask_frame``: frame of the mask; default: that of its file, or that of the maps. ``mask_apodisation_deg``: width
