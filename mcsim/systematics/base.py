@@ -145,6 +145,8 @@ class Effect:
     proposed
         False: a diagnosis proposes it only where it is asked for by name (``mcsim diagnose --with NAME``), or where it
         explains the data in the place of an effect that is about to be named.
+    completes
+        True: ``beam`` adds what the fiducial beam lacks of the measured one, before any other effect acts on it.
 
     Examples
     --------
@@ -183,6 +185,7 @@ class Effect:
     bounds: ClassVar[tuple[Bound, ...]] = ()
     parametrization: ClassVar[Parametrization] = Parametrization()
     proposed: ClassVar[bool] = True
+    completes: ClassVar[bool] = False
 
     amplitude: float = 0.0
 
@@ -335,9 +338,13 @@ def seen_through(acting: Sequence[Effect], site: Site, displacing: Sequence[Effe
     """Return the beam about the fiducial line of sight: every effect on its shape first, then all that displaces it.
 
     ``displacing``: the effects that displace the line of sight; default: all.
+
+    Notes
+    -----
+    Effects of one stage act in their order, but for those that complete the beam, which act before any other.
     """
     beam = site.beam
-    for effect in acting:
+    for effect in sorted(acting, key=lambda one: not one.completes):
         beam = effect.beam(beam, site) if effect.amplitude != 0.0 else beam
     for effect in acting if displacing is None else displacing:
         beam = effect.pointing(beam, site) if effect.amplitude != 0.0 else beam

@@ -94,6 +94,7 @@ class BeamNoncircularity(Effect):
     b_lm + amplitude b_lm of the whole beam at the orders m > m_max. With m_max = 0 that is all that makes the beam
     non-circular: its ellipse, its coma, and what no closed form has. The whole beam has the orders that it would have
     without m_max, and four at least where its source has them. Of a differencing scan both sides' beams must be cut.
+    It acts before all other effects on the beam, wherever it is listed: these change the beam as measured.
     """
 
     name = "beam_noncircularity"
@@ -106,6 +107,7 @@ class BeamNoncircularity(Effect):
     source = "Joshi et al. arXiv:1210.7318, Sec. IV"
     step = 0.05
     bounds = (Bound("amplitude", -2.0, 2.0, "1 is the beam as measured; a prior of this library: at most twice that"),)
+    completes = True
 
     def beam(self, beam: Beam, site: Site) -> Beam:
         whole, kept = site.whole_beam(self.name), site.beam.mmax + 1

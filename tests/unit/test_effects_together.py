@@ -1,0 +1,48 @@
+"""Several effects in one channel: the order in which they act, whatever the order in which they are listed."""
+
+from dataclasses import replace
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from mcsim import systematics
+from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan import ScanModel
+
+FWHM, LMAX = 240.0, 96
+
+
+def site_of(beam: Beam) -> systematics.Site:
+    """A channel with WMAP's scan."""
+    model = ScanModel.load("wmap")
+    pointing = systematics.Pointing(model, model.line_of_sight("A"))
+    return systematics.Site(
+        channel="W1", frequency_ghz=94.0, frame="ecliptic", nside=16, lmax=LMAX, beam=beam, pointing=pointing
+    )
+
+
+def effect(name: str, amplitude: float, **parameters: float) -> systematics.Effect:
+    return systematics.get(name)(amplitude=amplitude, **parameters)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        effect("calibration", 0.2),
+        effect("beam_width", 0.1),
+        effect("beam_ellipticity", 0.1, angle_deg=70.0),
+        effect("pointing_jitter", 100.0),
+    ],
+    ids=lambda one: one.name,
+)
+def test_effects_act_on_the_orders_that_a_beam_gets_back(other):
+    """A beam with all of its orders back is the beam as measured, to any effect beside, before or after it."""
+    measured = Beam.elliptical(1.1 * FWHM, FWHM / 1.1, angle_deg=20.0, lmax=LMAX, mmax=4)
+    site = replace(site_of(measured.truncated(0)), whole=lambda: measured)
+    expected = systematics.seen_through([other], site_of(measured)).blm
+    restored = effect("beam_noncircularity", 1.0)
+    for acting in permutations([other, restored]):
+        found = systematics.seen_through(acting, site).blm
+        orders = min(len(found), len(expected))
+        np.testing.assert_allclose(found[:orders], expected[:orders], rtol=0.0, atol=1e-12)
