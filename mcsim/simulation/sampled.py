@@ -48,7 +48,7 @@ def maps(
             seen = seen + dipole_alm(site.dipole_uk, site.lmax)
             fiducial = replace(site.beam, blm=site.beam.blm[:2, :2])
             after.append(tod.sky_signal(-dipole_alm(site.dipole_uk, 1), 1, fiducial, epsilon, nthreads))
-        beam = systematics.seen_through(acting, site, [effect for effect in acting if not _moves(effect)])
+        beam = systematics.seen_through(acting, site, [effect for effect in acting if not systematics.reach(effect)])
         observe = tod.sky_signal(seen, site.lmax, beam, epsilon, nthreads)
         for index, m in enumerate(channel.maps):
             grid = MapGrid(site.nside, site.frame, run.map.span(index))
@@ -90,11 +90,6 @@ def check(channel: Channel) -> None:
             )
 
 
-def _moves(effect: systematics.Effect) -> bool:
-    nowhere = np.zeros(1)
-    return effect.lags() is not None or effect.moved(nowhere, nowhere, nowhere) is not None
-
-
 def _fiducial(channel: Channel, grid: MapGrid, delay_s: float = 0.0) -> Iterator[tod.Samples]:
     """Yield the channel's samples at their fiducial pointing, or at that of ``delay_s`` before."""
     pointing = channel.site.pointed("of sampled maps")
@@ -108,7 +103,8 @@ def _seen(channel: Channel, grid: MapGrid, observe: tod.Stage) -> Iterator[tod.S
         more = effect.lags()
         if more is not None:
             lags = [(weight * w, delay + d) for weight, delay in lags for w, d in more]
-    if len(lags) == 1 and not any(map(_moves, channel.effects)) and systematics.spread_of(channel.effects) == 1.0:
+    in_place = systematics.spread_of(channel.effects) == 1.0 and not any(map(systematics.reach, channel.effects))
+    if len(lags) == 1 and in_place:
         yield from observe(_fiducial(channel, grid))
         return
     streams = [observe(_true(channel, grid, delay)) for _, delay in lags]

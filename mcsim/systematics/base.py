@@ -341,14 +341,24 @@ def seen_through(acting: Sequence[Effect], site: Site, displacing: Sequence[Effe
 
     Notes
     -----
-    Effects of one stage act in their order, but for those that complete the beam, which act before any other.
+    Effects of one stage act in their order, but for those that complete the beam, which act before any other, and for
+    those on the pointing: what turns with the beam comes first, then what moves samples, and the memory of earlier ones
+    last, as in the sample-by-sample route.
     """
     beam = site.beam
     for effect in sorted(acting, key=lambda one: not one.completes):
         beam = effect.beam(beam, site) if effect.amplitude != 0.0 else beam
-    for effect in acting if displacing is None else displacing:
+    for effect in sorted(acting if displacing is None else displacing, key=reach):
         beam = effect.pointing(beam, site) if effect.amplitude != 0.0 else beam
     return beam
+
+
+def reach(effect: Effect) -> int:
+    """Return 2 for an effect that mixes in signals of earlier samples, 1 for one that moves samples, 0 for others."""
+    if effect.lags() is not None:
+        return 2
+    nowhere = np.zeros(1)
+    return 0 if effect.moved(nowhere, nowhere, nowhere) is None else 1
 
 
 def rescaling(acting: Iterable[Effect], site: Site) -> float:
