@@ -242,7 +242,7 @@ def _with_samples_of(scene: Scene, whole: Survey) -> Survey:
         site = replace(site, pointing=replace(known, model=scene.motion or known.model))
     otherwise = bool(late) or scene.psi[0] < 0 or scene.centred
     seen = (_Seen(late_s=late, sign=scene.psi[0], centred=scene.centred),) if otherwise else ()
-    return replace(whole.making, channels=(replace(channel, site=site, effects=(*channel.effects, *seen)),))
+    return replace(whole.making, channels=(replace(channel, site=site, effects=(*seen, *channel.effects)),))
 
 
 def _periods(motion: ScanModel | None) -> tuple[float, float]:

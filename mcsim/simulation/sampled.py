@@ -120,7 +120,7 @@ def _true(channel: Channel, grid: MapGrid, delay_s: float) -> Iterator[tod.Sampl
         references = _fiducial(channel, grid)
     for chunk in _fiducial(channel, grid, delay_s):
         theta, phi, psi = chunk.theta, chunk.phi, chunk.psi
-        for effect in channel.effects:
+        for effect in reversed(channel.effects):  # the first one is the nearest to the beam
             moved = effect.moved(theta, phi, psi)
             if moved is not None:
                 theta, phi, psi = moved
