@@ -403,6 +403,7 @@ def tried(acting: Sequence[Effect], site: Site) -> Beam:
     for effect in acting:
         effect.gain(once, site)
         effect.noise(site)
+        effect.differencing(0.0, 0)
     for effect in adding(acting):
         site.pointed(effect.name)
         effect.signal(once, once, once, once, site)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from mcsim.errors import InputError
 from mcsim.systematics.base import Bound, Effect, Wording
 from mcsim.systematics.parametrization import Steps
 
@@ -52,4 +53,9 @@ class MapmakingConvergence(Effect):
     parametrization = Steps(sign=1, factor=1.5)
 
     def differencing(self, imbalance: float, iterations_short: int) -> tuple[float, int]:
+        if self.amplitude < 0.0:
+            raise InputError(
+                f"effect {self.name}: amplitude = {self.amplitude:g} iterations are more than it takes to converge; "
+                "give 0 or more, and lower scan.tolerance for a map that has converged further."
+            )
         return imbalance, iterations_short + round(self.amplitude)

@@ -327,3 +327,10 @@ def test_a_differencing_scan_is_less_balanced_and_solved_for_less():
     assert systematics.get("transmission_imbalance")(amplitude=0.002).differencing(0.001, 3) == (0.003, 3)
     assert systematics.get("mapmaking_convergence")(amplitude=4.0).differencing(0.001, 3) == (0.001, 7)
     assert systematics.get("pixelization")(amplitude=0.3).spread() == pytest.approx(0.7)
+
+
+def test_a_map_making_cannot_be_more_than_converged(site):
+    early = systematics.get("mapmaking_convergence")(amplitude=-5.0)
+    for act in (lambda: early.differencing(0.001, 3), lambda: systematics.tried([early], site)):
+        with refused("mapmaking_convergence", -5, 0, "scan.tolerance"):
+            act()
