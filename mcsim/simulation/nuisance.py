@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcsim import config, systematics
 from mcsim.config.messages import standing
@@ -16,7 +17,7 @@ from mcsim.simulation.channels import check_scope, site_of, table_of
 from mcsim.simulation.pixel_means import gain_of, mean_gain, mean_signal, signal_of
 from mcsim.simulation.survey import Channel, Survey, survey, with_effects
 from mcsim.sphere import rng
-from mcsim.support.arrays import Map, Vector
+from mcsim.support.arrays import Vector
 from mcsim.systematics import Effect, Library, basis_of, seen_through, spread_of, tried
 
 _OF_BEAMS = ("beam", "pointing", "spread")
@@ -238,39 +239,60 @@ class DisturbedSurvey:
         maps = []
         for place, m in enumerate(channel.maps):
             share = self.survey.config.map.span(place)
-            means = {"gain": [m.gain, mean_gain(bent, site, share)]}
-            means["signal_uk"] = [m.signal_uk, mean_signal(bent, site, share)]
+            gains = [self._own_gains[channel.name][place], mean_gain(bent, site, share, self._orders(channel))]
+            signals = [m.signal_uk, mean_signal(bent, site, share)]
             for (number, name, key), basis in self._means.items():
                 if name == channel.name:
-                    effect = drawn[number][1]
-                    means[key].append(effect.parametrization.coordinates(effect) @ basis[place])
+                    coordinates = drawn[number][1].parametrization.coordinates(drawn[number][1])
+                    (gains if key == "gain" else signals).append(np.tensordot(coordinates, basis[place], 1))
             own = with_effects(m, more, site)
-            maps.append(replace(own, gain=_sum(means["gain"]), signal_uk=_sum(means["signal_uk"])))
+            maps.append(replace(own, gain=_sum(gains), signal_uk=_sum(signals)))
         return replace(channel, beam=beam, response=response, maps=tuple(maps), effects=acting)
 
+    def _orders(self, channel: Channel) -> int:
+        """Return the highest order that the beam of a channel can have in a realization."""
+        turned = any(getattr(n.effect, hook) is not getattr(Effect, hook) for n in self.nuisances for hook in _OF_BEAMS)
+        return max(m.moments.smax for m in channel.maps) if turned else channel.beam.mmax
+
     @cached_property
-    def _means(self) -> dict[tuple[int, str, str], list[Map]]:
+    def _own_gains(self) -> dict[str, list[NDArray[np.complex128] | None]]:
+        """Return the errors of the gain that the run has itself, for all orders that beams can have, by channel."""
+        found: dict[str, list[NDArray[np.complex128] | None]] = {}
+        for channel in self.survey.making.channels:
+            rows = self._orders(channel) + 1
+            found[channel.name] = [
+                m.gain[:rows]
+                if m.gain is not None and len(m.gain) >= rows
+                else mean_gain(channel.effects, channel.site, self.survey.config.map.span(place), rows - 1)
+                for place, m in enumerate(channel.maps)
+            ]
+        return found
+
+    @cached_property
+    def _means(self) -> dict[tuple[int, str, str], list[NDArray]]:
         """Return the mean errors of the gain, and signals, per coordinate: linear in these, they take a pass each.
 
         Those of a nuisance with further parameters that are drawn are not linear, and take a pass for every draw.
-        By nuisance, channel, and name in a map: one array of shape (k, npix) for each map of the channel.
+        By nuisance, channel, and name in a map: one array for each map of the channel, shape (k, npix), of the gain
+        (k, orders + 1, npix).
         """
         found = {}
         linear = [(number, one) for number, one in enumerate(self.nuisances) if not one.parameter_widths]
         for (number, one), channel in product(linear, self.survey.making.channels):
-            for key, hook, mean in (("gain", "gain", gain_of), ("signal_uk", "signal", signal_of)):
+            of_orders = partial(gain_of, orders=self._orders(channel))
+            for hook, mean in (("gain", of_orders), ("signal", signal_of)):
                 if getattr(one.effect, hook) is getattr(Effect, hook) or one.channel not in (None, channel.name):
                     continue
                 basis = basis_of(one.effect, one.settings)
                 shares = [self.survey.config.map.span(n) for n in range(len(channel.maps))]
-                found[number, channel.name, key] = [
+                found[number, channel.name, hook] = [
                     np.stack([mean(effect, channel.site, share) / effect.amplitude for effect in basis])
                     for share in shares
                 ]
         return found
 
 
-def _sum(terms: Sequence[Map | None]) -> Map | None:
-    """Return the sum of maps, None for no map."""
+def _sum(terms: Sequence[NDArray | None]) -> NDArray | None:
+    """Return the sum of arrays of maps, None for no map."""
     maps = [term for term in terms if term is not None]
     return sum(maps[1:], start=maps[0]) if maps else None

@@ -190,7 +190,8 @@ def _map_parts(
             yield m, MapParts(circular_uk, None, rest_uk)
         return
     circular = _circular(channel, seen, dipole)
-    spins = convolve.spin_maps(seen, channel.response, nside, nthreads)
+    seen_spins = convolve.spin_maps(seen, channel.response, nside, nthreads)
+    spins = dict(seen_spins)
     if dipole is not None:
         for s, map_uk in convolve.spin_maps(dipole, _fiducial_response(channel), nside, nthreads).items():
             spins[s] = spins[s] - map_uk if s in spins else -map_uk
@@ -217,10 +218,13 @@ def _map_parts(
             draw = rng.generator(seed, realization, f"{own}/noise/{m.name}")
             extra.append(divided(effect.excess(m.moments.hits, draw), m.moments.hits))
         if m.gain is not None and whole is not None:
-            extra.append(m.gain * whole)
+            extra.append(m.gain[0].real * whole)
         if m.signal_uk is not None:
             extra.append(m.signal_uk)
         difference = convolve.noncircular_map(spins, m.moments) if spins else None
+        if m.gain is not None and seen_spins:
+            drifting = convolve.noncircular_map(seen_spins, replace(m.moments, w=m.gain[1:]))
+            difference = drifting if difference is None else difference + drifting
         yield m, MapParts(flat, sum(extra[1:], start=extra[0]) if extra else None, difference)
 
 

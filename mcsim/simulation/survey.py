@@ -55,8 +55,9 @@ class SurveyMap:
     #: for; ``None``: no noise, or noise of differences
     noise_uk: NDArray[np.float64] | None
     pairs: mapmaking.DifferencingScan | None = None  #: pairs of pixels of a differencing scan; ``None``: any other scan
-    #: mean relative error of the gain over the samples of a pixel, shape (npix,); ``None``: no error
-    gain: NDArray[np.float64] | None = None
+    #: means over the samples of a pixel of g e^{-i s psi}, g the relative error of the gain, for s from 0 to the orders
+    #: of the beam, shape (orders + 1, npix); ``None``: no error
+    gain: NDArray[np.complex128] | None = None
     #: mean of what effects add to the samples of a pixel, shape (npix,); ``None``: nothing
     signal_uk: NDArray[np.float64] | None = None
     preparation: Preparation | None = None  #: what is done to the map after it is made; ``None``: nothing
@@ -253,8 +254,8 @@ def _channel(
         if pairs is not None and orders:
             m = replace(m, noise_uk=mapmaking.level_uk(pairs, _sigma0_uk(spec)))
         m = with_effects(m, acting, site)
-        gain, signal = (mean(acting, site, grid.time_range) for mean in (mean_gain, mean_signal))
-        maps.append(replace(m, gain=gain, signal_uk=signal))
+        gain = mean_gain(acting, site, grid.time_range, beam.mmax)
+        maps.append(replace(m, gain=gain, signal_uk=mean_signal(acting, site, grid.time_range)))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
     spread = spread_of(acting)
     seen_window = window ** (spread * spread)

@@ -38,7 +38,7 @@ def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> No
     )
     drifts = [systematics.get("gain_drift")(amplitude=0.01, phase_deg=phase) for phase in (0.0, 90.0)]
     passes = []
-    monkeypatch.setattr(pixel_means, "mean_gain", lambda *args: passes.append(args) or mean_gain(*args))
+    monkeypatch.setattr(pixel_means, "mean_gain", lambda *args, **how: passes.append(args) or mean_gain(*args, **how))
     for _ in range(2):
         for drift in drifts:
             for share in HALVES:
