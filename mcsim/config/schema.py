@@ -89,6 +89,10 @@ class Map:
         count = len(self.splits) if self.split_by == "time" and self.splits else 1
         return index % count / count, (index % count + 1) / count
 
+    def rings(self, index: int) -> tuple[int, int] | None:
+        """Return every how many rings belong to a split, and the first one; None: all rings of its span."""
+        return (len(self.splits), index) if self.split_by == "rings" else None
+
     @model_validator(mode="after")
     def _pixels_and_mask(self) -> Self:
         if self.grid == "healpix" and self.nside is None:

@@ -14,7 +14,7 @@ from mcsim import systematics
 from mcsim.bipolar import by_degree
 from mcsim.datavector.wiener_filter import FilteredMaps, Model
 from mcsim.simulation import differencing
-from mcsim.simulation.pixel_means import gain_of, signal_of
+from mcsim.simulation.pixel_means import Part, gain_of, signal_of
 from mcsim.simulation.survey import Channel, SurveyMap
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
@@ -94,7 +94,7 @@ def _beam_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter | 
 def _gain_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
     """Correlate residuals with sky and dipole times the mean gain error of every pixel."""
     site, parts, lmax = model.survey.channels[channel].site, model.of(channel), max(model.lmax, 1)
-    errors = [gain_of(effect, site, model.survey.config.map.span(n))[0].real for n in range(len(parts))]
+    errors = [gain_of(effect, site, Part.of(model.survey.config, n))[0].real for n in range(len(parts))]
     dipole = healpix.synthesis(dipole_alm(site.dipole_uk, lmax)[None], model.nside, lmax)[0]
 
     def value(filtered: FilteredMaps) -> float:
@@ -107,7 +107,7 @@ def _gain_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
 def _signal_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
     """Correlate residuals with the mean of what is added to the samples of every pixel."""
     site, parts = model.survey.channels[channel].site, model.of(channel)
-    signals = [signal_of(effect, site, model.survey.config.map.span(n)) for n in range(len(parts))]
+    signals = [signal_of(effect, site, Part.of(model.survey.config, n)) for n in range(len(parts))]
 
     def value(filtered: FilteredMaps) -> float:
         return float(sum(np.dot(filtered.residual[i], signal) for i, signal in zip(parts, signals, strict=True)))

@@ -40,7 +40,7 @@ from mcsim.reconstruction.scores import (
 )
 from mcsim.reconstruction.search import LEVEL, Search, evidence
 from mcsim.simulation import simulate
-from mcsim.simulation.pixel_means import signal_of
+from mcsim.simulation.pixel_means import Part, signal_of
 from mcsim.simulation.tod import samples
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
@@ -146,9 +146,9 @@ def with_chosen(model: Model, scene: Scene, kinds: Sequence[str]) -> Scene:
 def _waves(model: Model, i: int, values: Mapping[str, Any]) -> tuple[Map, ...]:
     """Return the means of cosine and sine of a wave, or of a trend, over the samples of every pixel of a map."""
     channel, split = model.parts[i].channel, model.of(model.parts[i].channel).index(i)
-    site, span = model.survey.channels[channel].site, model.survey.config.map.span(split)
+    site, part = model.survey.channels[channel].site, Part.of(model.survey.config, split)
     components = range(1 if values["wave"] == "trend" else 2)
-    return tuple(signal_of(_wave(*values.items(), component=c)(amplitude=1.0), site, span) for c in components)
+    return tuple(signal_of(_wave(*values.items(), component=c)(amplitude=1.0), site, part) for c in components)
 
 
 def _time_line(model: Model, channel: int) -> TimeLine:

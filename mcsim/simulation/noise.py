@@ -208,9 +208,8 @@ def _correlated(
     rings = None
     if split is not None:
         place = run.map.splits.index(split)
-        if run.map.split_by == "rings":
-            rings = (len(run.map.splits), place)  # rings of one time stream
-        else:
+        rings = run.map.rings(place)
+        if rings is None:  # rings are of one time stream
             name = f"{spec.name}:{split}"
     grid = MapGrid(moments.nside, moments.frame, run.map.span(place))
     return timestream.correlated_noise(noise, scan_model(spec, spec.scan, split), grid, f"noise/{name}", rings)

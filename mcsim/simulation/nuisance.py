@@ -14,7 +14,7 @@ from mcsim.config.messages import standing
 from mcsim.errors import InputError
 from mcsim.simulation import convolve
 from mcsim.simulation.channels import check_scope, site_of, table_of
-from mcsim.simulation.pixel_means import gain_of, mean_gain, mean_signal, signal_of
+from mcsim.simulation.pixel_means import Part, gain_of, mean_gain, mean_signal, signal_of
 from mcsim.simulation.survey import Channel, Survey, survey, with_effects
 from mcsim.sphere import rng
 from mcsim.support.arrays import Vector
@@ -238,9 +238,9 @@ class DisturbedSurvey:
         bent = tuple(effect for one, effect in drawn if one.parameter_widths and one.channel in (None, channel.name))
         maps = []
         for place, m in enumerate(channel.maps):
-            share = self.survey.config.map.span(place)
-            gains = [self._own_gains[channel.name][place], mean_gain(bent, site, share, self._orders(channel))]
-            signals = [m.signal_uk, mean_signal(bent, site, share)]
+            part = Part.of(self.survey.config, place)
+            gains = [self._own_gains[channel.name][place], mean_gain(bent, site, part, self._orders(channel))]
+            signals = [m.signal_uk, mean_signal(bent, site, part)]
             for (number, name, key), basis in self._means.items():
                 if name == channel.name:
                     coordinates = drawn[number][1].parametrization.coordinates(drawn[number][1])
@@ -263,7 +263,7 @@ class DisturbedSurvey:
             found[channel.name] = [
                 m.gain[:rows]
                 if m.gain is not None and len(m.gain) >= rows
-                else mean_gain(channel.effects, channel.site, self.survey.config.map.span(place), rows - 1)
+                else mean_gain(channel.effects, channel.site, Part.of(self.survey.config, place), rows - 1)
                 for place, m in enumerate(channel.maps)
             ]
         return found
@@ -284,10 +284,10 @@ class DisturbedSurvey:
                 if getattr(one.effect, hook) is getattr(Effect, hook) or one.channel not in (None, channel.name):
                     continue
                 basis = basis_of(one.effect, one.settings)
-                shares = [self.survey.config.map.span(n) for n in range(len(channel.maps))]
+                parts = [Part.of(self.survey.config, n) for n in range(len(channel.maps))]
                 found[number, channel.name, hook] = [
-                    np.stack([mean(effect, channel.site, share) / effect.amplitude for effect in basis])
-                    for share in shares
+                    np.stack([mean(effect, channel.site, part) / effect.amplitude for effect in basis])
+                    for part in parts
                 ]
         return found
 

@@ -53,8 +53,8 @@ def maps(
         for index, m in enumerate(channel.maps):
             grid = MapGrid(site.nside, site.frame, run.map.span(index))
             stages = [*after, _added(channel)]
-            if run.map.split_by == "rings":
-                stages.append(tod.every_ring(site.pointed("of rings").model.spin_period_s, len(channel.maps), index))
+            if (rings := run.map.rings(index)) is not None:
+                stages.append(tod.every_ring(site.pointed("of rings").model.spin_period_s, *rings))
             draw = rng.generator(run.ensemble.seed, realization, f"noise/{m.name}")
             given = spec.noise_of(run.map.each_split[index])
             of_samples = isinstance(given, config.Noise) and given.hits is None

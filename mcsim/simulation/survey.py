@@ -28,7 +28,7 @@ from mcsim.simulation.channels import (
 )
 from mcsim.simulation.filtering import Filtering
 from mcsim.simulation.noise import DrawnNoise, of_map
-from mcsim.simulation.pixel_means import mean_gain, mean_signal
+from mcsim.simulation.pixel_means import Part, mean_gain, mean_signal
 from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
 from mcsim.simulation.survey_filter import filtering_of
@@ -254,8 +254,9 @@ def _channel(
         if pairs is not None and orders:
             m = replace(m, noise_uk=mapmaking.level_uk(pairs, _sigma0_uk(spec)))
         m = with_effects(m, acting, site)
-        gain = mean_gain(acting, site, grid.time_range, beam.mmax)
-        maps.append(replace(m, gain=gain, signal_uk=mean_signal(acting, site, grid.time_range)))
+        part = Part.of(run, index)
+        gain, signal_uk = mean_gain(acting, site, part, beam.mmax), mean_signal(acting, site, part)
+        maps.append(replace(m, gain=gain, signal_uk=signal_uk))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
     spread = spread_of(acting)
     seen_window = window ** (spread * spread)

@@ -13,13 +13,13 @@ from mcsim.datavector.wiener_filter import model_of, shared_sky, wiener_filter
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
 from mcsim.simulation import pixel_means, simulate
-from mcsim.simulation.pixel_means import mean_gain
+from mcsim.simulation.pixel_means import Part, mean_gain
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import FRAMES
 
-HALVES = ((0.0, 0.5), (0.5, 1.0))
+HALVES = (Part((0.0, 0.5)), Part((0.5, 1.0)))
 
 
 @pytest.mark.slow
@@ -41,11 +41,11 @@ def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(pixel_means, "mean_gain", lambda *args, **how: passes.append(args) or mean_gain(*args, **how))
     for _ in range(2):
         for drift in drifts:
-            for share in HALVES:
-                np.testing.assert_array_equal(pixel_means.gain_of(drift, site, share), mean_gain((drift,), site, share))
+            for half in HALVES:
+                np.testing.assert_array_equal(pixel_means.gain_of(drift, site, half), mean_gain((drift,), site, half))
     assert len(passes) == 4
     # A sine of the year is positive in its first half and as negative in its second.
-    first, second = (pixel_means.gain_of(drifts[1], site, share).mean() for share in HALVES)
+    first, second = (pixel_means.gain_of(drifts[1], site, half).mean() for half in HALVES)
     assert first == pytest.approx(0.01 * 2 / np.pi, rel=0.1)
     assert second == pytest.approx(-first, rel=0.1)
 

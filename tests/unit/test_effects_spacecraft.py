@@ -14,7 +14,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel
 from mcsim.instrument.scan.pointing import pointing
 from mcsim.simulation import tod
-from mcsim.simulation.pixel_means import mean_signal
+from mcsim.simulation.pixel_means import Part, mean_signal
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm, gaussian_alm
@@ -157,7 +157,7 @@ def test_a_far_lobe_sees_the_galaxy_that_it_is_given(site, tmp_path):
 
 def test_what_is_added_to_samples_is_averaged_in_pixels_of_each_half(site):
     effect = systematics.get("orbital_dipole")(amplitude=0.1)
-    first, second = (mean_signal((effect,), site, share) for share in ((0.0, 0.5), (0.5, 1.0)))
+    first, second = (mean_signal((effect,), site, Part(share)) for share in ((0.0, 0.5), (0.5, 1.0)))
     # A dipole that turns through the year has the opposite sign in the other half.
     assert np.corrcoef(first, second)[0, 1] < -0.7
     model, line = site.pointing.model, site.pointing.line
@@ -168,7 +168,7 @@ def test_what_is_added_to_samples_is_averaged_in_pixels_of_each_half(site):
     chosen = np.bincount(pixel, minlength=first.size).argmax()
     each = effect.signal(time_s, theta, phi, psi, site)[pixel == chosen]
     assert first[chosen] == pytest.approx(each.mean(), rel=1e-10)
-    assert mean_signal((replace(effect, amplitude=0.0),), site, (0.0, 0.5)) is None
+    assert mean_signal((replace(effect, amplitude=0.0),), site, Part((0.0, 0.5))) is None
     with refused("orbital_dipole", "W1"):
         systematics.tried((effect,), replace(site, pointing=None))
 
