@@ -280,13 +280,16 @@ def _looks(pair: ChannelPair, explained: NDArray[np.float64]) -> tuple[str, ...]
 def _described(found: Set, problem: Problem) -> tuple[DifferenceResult, ...]:
     described = []
     for index, (difference, made) in enumerate(found.members):
-        value = difference.inverse(made) if problem.pair.turned else made
+        value, said = made, [difference.said(made)]
+        if problem.pair.turned:
+            value = difference.inverse(made)
+            said = [difference.said(value), difference.found(made)]
         rest = (*found.members[:index], *found.members[index + 1 :])
         without = problem.left(rest, found.correction) if rest else 1.0
         described.append(
             DifferenceResult(
                 difference.name, problem.pair.name, difference.amplitude(value), difference.unit,
-                without - found.left, difference.parameters(value), difference.met, difference.said(value),
+                without - found.left, difference.parameters(value), difference.met, "; ".join(filter(None, said)),
             )
         )  # fmt: skip
     return tuple(described)

@@ -118,6 +118,10 @@ class Difference:
         """Return the amplitude in words, where its sign alone would mislead."""
         return ""
 
+    def found(self, value: Vector) -> str:
+        """Return in words what side A has more than side B, where the inverse of that may say less."""
+        return ""
+
     def parameters(self, value: Vector) -> dict[str, float | str]:
         """Return what else describes the value."""
         return {}

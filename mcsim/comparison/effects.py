@@ -67,7 +67,7 @@ class EffectDifference(Difference):
         return value / max(1.0, float(np.sqrt(size)))
 
     def inverse(self, value: Vector) -> Vector:
-        return -value if self.linear else -value / (1.0 + value)
+        return self.kind.parametrization.coordinates(self._effect(value).inverse())
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         return maps + np.tensordot(value, self._templates_in(state), 1)
@@ -158,6 +158,10 @@ class EffectDifference(Difference):
         amplitude, wording = self.amplitude(value), self.kind.wording
         own = wording is not None and wording.negative is not None and amplitude < 0.0
         return self.kind.format_amplitude(amplitude) if own else ""
+
+    def found(self, value: Vector) -> str:
+        """Return the effect of side A, which only some effects of side B take back exactly."""
+        return f"in side A: {self._effect(value).describe()}"
 
     def parameters(self, value: Vector) -> dict[str, float | str]:
         return {k: v for k, v in self._effect(value).parameters().items() if isinstance(v, float | str)}

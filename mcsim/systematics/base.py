@@ -307,6 +307,10 @@ class Effect:
         """Return the same effect with ``factor`` times the amplitude."""
         return replace(self, amplitude=factor * self.amplitude)
 
+    def inverse(self) -> Self:
+        """Return the effect that takes this one back where both act: exactly, or to first order in the amplitude."""
+        return self.scaled(-1.0)
+
 
 @dataclass(frozen=True, kw_only=True)
 class DirectedEffect(Effect):

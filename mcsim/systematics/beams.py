@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.systematics.base import Bound, Effect, Site, Wording, scan_direction
-from mcsim.systematics.parametrization import Angle, Parametrization, Vector
+from mcsim.systematics.parametrization import Angle, Parametrization, Vector, reciprocal
 from mcsim.systematics.shape import shape, stretched
 
 
@@ -36,6 +36,9 @@ class BeamWidth(Effect):
                 "choose one between -0.9 and 9."
             )
         return stretched(beam, 1.0 + self.amplitude, 1.0 + self.amplitude, 0.0, 2, 0)
+
+    def inverse(self) -> Self:
+        return replace(self, amplitude=reciprocal(self.amplitude))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,7 @@
 """Effects on the gain: constant, with the year, with the spin, with the signal."""
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -8,7 +9,7 @@ from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.sphere.sky import dipole_alm
 from mcsim.systematics.base import Alm, Bound, Draw, Effect, Site, Wording
-from mcsim.systematics.parametrization import Angle, Vector
+from mcsim.systematics.parametrization import Angle, Vector, reciprocal
 from mcsim.systematics.product import multiplied
 from mcsim.systematics.spacecraft import spin_phase
 
@@ -40,6 +41,9 @@ class Calibration(Effect):
                 f"effect {self.name}: amplitude = {self.amplitude:g} leaves no signal; choose one above -1."
             )
         return replace(beam, blm=(1.0 + self.amplitude) * beam.blm)
+
+    def inverse(self) -> Self:
+        return replace(self, amplitude=reciprocal(self.amplitude))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,11 @@ from numpy.typing import NDArray
 Vector = NDArray[np.float64]
 
 
+def reciprocal(share: float) -> float:
+    """Return b with (1 + share) (1 + b) = 1; where that is not positive there is none, and b = -share."""
+    return -share / (1.0 + share) if share > -1.0 else -share
+
+
 @dataclass(frozen=True, kw_only=True)
 class Parametrization:
     """Fit the amplitude of an effect alone; derived classes fit further parameters with it.

@@ -15,7 +15,7 @@ from mcsim.comparison.effects import effects_of
 from mcsim.comparison.map_differences import NoiseShared
 from mcsim.comparison.pairs import ChannelPair, given
 from mcsim.comparison.scene_differences import TimeShift
-from mcsim.simulation import simulate
+from mcsim.simulation import sampled, simulate
 from mcsim.simulation.channels import MOST_ORDERS, NEGLECTED, load_beam, with_all_orders
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotate_alm
@@ -263,6 +263,31 @@ def test_a_gain_beside_a_dipole_is_a_factor_from_either_side(tmp_path):
         found = mcsim.compare(*sides)
         assert names(found) == ["calibration"]
         assert found.channels[0].differences[0].amplitude == pytest.approx(amplitude, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "amplitude", "words"),
+    [
+        ("beam_width", 0.2, 1.0 / 1.2 - 1.0, "in side A: FWHM 20"),
+        ("beam_ellipticity", 0.1, 0.1, "in side A: axis ratio 1.1"),
+        ("beam_coma", 0.1, 0.1, "in side A: k = 0.1"),
+    ],
+)
+def test_an_effect_of_side_a_is_taken_back_in_side_b(tmp_path, name, size, amplitude, words):
+    """A beam that is a fifth wider is made narrower by a sixth; what side A has is said besides."""
+    for side in ("acting", "plain"):
+        (tmp_path / side).mkdir()
+    (tmp_path / "plain" / "model.toml").write_text(DESCRIPTION.replace("20.0 }", "20.0, m_max = 4 }"))
+    plain = config.load(tmp_path / "plain" / "model.toml")
+    acting = replace(plain, effects=(config.Effect(name=name, channel="W1", parameters={"amplitude": size}),))
+    for run in (plain, acting):
+        [(_, map_)] = sampled.maps(survey(run), 0)
+        file = tmp_path / ("acting" if run.effects else "plain") / "W1.fits"
+        healpy.write_map(file, map_, dtype=np.float64, coord="E", column_units="uK")
+    found = mcsim.compare(tmp_path / "acting", tmp_path / "plain")
+    assert names(found) == [name]
+    assert found.channels[0].differences[0].amplitude == pytest.approx(amplitude, rel=0.03)
+    assert words in str(found)
 
 
 def test_another_spectrum_is_no_cause_where_no_sample_can_be_elsewhere(tmp_path):

@@ -46,3 +46,28 @@ def test_effects_act_on_the_orders_that_a_beam_gets_back(other):
         found = systematics.seen_through(acting, site).blm
         orders = min(len(found), len(expected))
         np.testing.assert_allclose(found[:orders], expected[:orders], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("one", "least"),
+    [
+        (effect("calibration", 0.2), 1e-15),
+        (effect("beam_width", 0.2), 1e-6),
+        (effect("beam_ellipticity", 0.2, angle_deg=70.0), 1e-4),
+        (effect("pointing_offset", 60.0, angle_deg=70.0), 1e-7),
+        (effect("time_constant", 0.02), 1e-3),
+        (effect("beam_coma", 0.01, angle_deg=70.0), 1e-2),
+    ],
+    ids=lambda one: getattr(one, "name", ""),
+)
+def test_the_inverse_of_an_effect_takes_it_back(one, least):
+    """Exactly where there is such an effect; of a late signal, or of a coma, by all but the square of the amplitude.
+
+    A beam's continuation beyond lmax is good to 1e-6, and what is cut off beyond its orders is 1e-8 of its power.
+    """
+    site = site_of(Beam.elliptical(1.05 * FWHM, FWHM / 1.05, angle_deg=20.0, lmax=LMAX, mmax=8))
+    changed, back = (systematics.seen_through(acting, site).blm for acting in ([one], [one, one.inverse()]))
+    before = site.beam.blm[:5]
+    change = np.abs(changed[:5] - before).max()
+    assert np.abs(back[:5] - before).max() < least * np.abs(before).max()
+    assert np.abs(back[:5] - before).max() < 0.2 * change
