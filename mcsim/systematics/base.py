@@ -145,8 +145,8 @@ class Effect:
     proposed
         False: a diagnosis proposes it only where it is asked for by name (``mcsim diagnose --with NAME``), or where it
         explains the data in the place of an effect that is about to be named.
-    completes
-        True: ``beam`` adds what the fiducial beam lacks of the measured one, before any other effect acts on it.
+    rank
+        Effects on the shape of a beam act by rank: -1 completes the fiducial beam, 1 adds what no other one changes.
 
     Examples
     --------
@@ -185,7 +185,7 @@ class Effect:
     bounds: ClassVar[tuple[Bound, ...]] = ()
     parametrization: ClassVar[Parametrization] = Parametrization()
     proposed: ClassVar[bool] = True
-    completes: ClassVar[bool] = False
+    rank: ClassVar[int] = 0
 
     amplitude: float = 0.0
 
@@ -345,12 +345,11 @@ def seen_through(acting: Sequence[Effect], site: Site, displacing: Sequence[Effe
 
     Notes
     -----
-    Effects of one stage act in their order, but for those that complete the beam, which act before any other, and for
-    those on the pointing: what turns with the beam comes first, then what moves samples, and the memory of earlier ones
-    last, as in the sample-by-sample route.
+    Effects on the shape act by rank, those of one rank in their order. Of those on the pointing what turns with the
+    beam comes first, then what moves samples, and the memory of earlier ones last, as in the sample-by-sample route.
     """
     beam = site.beam
-    for effect in sorted(acting, key=lambda one: not one.completes):
+    for effect in sorted(acting, key=lambda one: one.rank):
         beam = effect.beam(beam, site) if effect.amplitude != 0.0 else beam
     for effect in sorted(acting if displacing is None else displacing, key=reach):
         beam = effect.pointing(beam, site) if effect.amplitude != 0.0 else beam

@@ -110,7 +110,7 @@ class BeamNoncircularity(Effect):
     source = "Joshi et al. arXiv:1210.7318, Sec. IV"
     step = 0.05
     bounds = (Bound("amplitude", -2.0, 2.0, "1 is the beam as measured; a prior of this library: at most twice that"),)
-    completes = True
+    rank = -1
 
     def beam(self, beam: Beam, site: Site) -> Beam:
         whole, kept = site.whole_beam(self.name), site.beam.mmax + 1
@@ -237,6 +237,10 @@ class BeamSidelobe(Effect):
     calibrated
         "none": the peak stays, and the beam's integral changes: it picks up a share of the dipole. "dipole": the gain
         is set by the dipole, so that none of it is left; the rest of the signal is rescaled by that.
+
+    Notes
+    -----
+    It acts after all other effects on the shape, which are of the main beam: a coma would amplify the ring.
     """
 
     name = "beam_sidelobe"
@@ -259,6 +263,7 @@ class BeamSidelobe(Effect):
         "calibrated = dipole": "calibrated on the dipole",
     }
     variants = ({"calibrated": "none"}, {"calibrated": "dipole"})
+    rank = 1
 
     quadrupole: float = 0.0
     radius_sigmas: float = 5.0

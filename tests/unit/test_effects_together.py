@@ -48,6 +48,16 @@ def test_effects_act_on_the_orders_that_a_beam_gets_back(other):
         np.testing.assert_allclose(found[:orders], expected[:orders], rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize("calibrated", ["none", "dipole"])
+def test_no_coma_amplifies_a_sidelobe(calibrated):
+    """(u^3 - 3u) of a ring at five sigmas is a hundred: its integral would grow by as much."""
+    beam = Beam.gaussian(FWHM, LMAX)
+    coma, ring = effect("beam_coma", 0.1), systematics.get("beam_sidelobe")(amplitude=0.005, calibrated=calibrated)
+    expected = ring.beam(coma.beam(beam, site_of(beam)), site_of(beam)).blm
+    for acting in permutations([coma, ring]):
+        np.testing.assert_array_equal(systematics.seen_through(acting, site_of(beam)).blm, expected)
+
+
 @pytest.mark.parametrize(
     ("one", "least"),
     [
