@@ -416,8 +416,8 @@ def tried(acting: Sequence[Effect], site: Site) -> Beam:
 
 
 def looked_at(acting: Iterable[Effect], sky: Alm, site: Site, seed: int, realization: int) -> Alm:
-    """Return the sky that a channel looks at, uK; what an effect draws depends on its own name, not on the channel."""
-    for effect, own in streams(acting):
+    """Return the sky that a channel looks at, uK: common effects come first, and draw alike in every channel."""
+    for effect, own in sorted(streams(acting), key=lambda one: one[0].scope == "channel"):
         if effect.amplitude == 0.0:
             continue
 

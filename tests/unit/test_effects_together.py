@@ -9,6 +9,8 @@ import pytest
 from mcsim import systematics
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
+from mcsim.sphere.sky import gaussian_alm
+from mcsim.sphere.spectra import load
 
 FWHM, LMAX = 240.0, 96
 
@@ -46,6 +48,21 @@ def test_effects_act_on_the_orders_that_a_beam_gets_back(other):
         found = systematics.seen_through(acting, site).blm
         orders = min(len(found), len(expected))
         np.testing.assert_allclose(found[:orders], expected[:orders], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "own",
+    [effect("dipole_residual", 30.0), effect("monopole_residual", 30.0), effect("nonlinearity", 0.05)],
+    ids=lambda one: one.name,
+)
+def test_the_sky_changes_before_a_channel_does(own):
+    """A modulation of the sky is none of a residual, nor of the response: all channels look at one sky."""
+    site = replace(site_of(Beam.gaussian(FWHM, LMAX)), dipole_uk=np.array([0.0, 0.0, 3364.5]))
+    sky = gaussian_alm(load("wmap7", LMAX), np.random.default_rng(1))
+    common = effect("dipole_modulation", 0.2)
+    expected = own.sky(systematics.looked_at([common], sky, site, 1, 0), site, np.random.default_rng)
+    for acting in permutations([own, common]):
+        np.testing.assert_array_equal(systematics.looked_at(acting, sky, site, 1, 0), expected)
 
 
 @pytest.mark.parametrize("calibrated", ["none", "dipole"])
