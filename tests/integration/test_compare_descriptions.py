@@ -310,6 +310,16 @@ def test_stored_maps_are_named_in_a_configuration(tmp_path, name):
         mcsim.compare(tmp_path / name, tmp_path / name, config.load(MODEL))
 
 
+def test_what_responds_by_rounding_alone_is_no_effect():
+    """The orientations of a whole survey are its own: of its halves they are not."""
+    for splits in ([], ["half1", "half2"]):
+        simulator = Simulator(small(map={"nside": 16, "splits": splits}))
+        [pair] = given(simulator(), simulator(), simulator.run).pairs
+        found = {one.name for one in effects_of(pair, simulator.run)}
+        assert {"beam_ellipticity", "gain_drift"} < found
+        assert ("orientation_averaging" in found) == bool(splits)
+
+
 def test_late_samples_add_no_dipole_to_an_effect():
     """A response to an ellipse has 0.1 uK of a dipole, and not the 770 uK by which late samples see it elsewhere."""
     made, dipole = [], {"dipole_uk": 3000.0, "dipole_lon_deg": 264.0, "dipole_lat_deg": 48.0}
