@@ -1,4 +1,4 @@
-"""Maps that one side alone has, or that no model describes."""
+"""What a comparison leaves out: maps that one side alone has, or that no model describes, and effects of the model."""
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,6 +23,18 @@ def not_compared(
             stacklevel=4,
         )
     return found
+
+
+def warn_of_effects(run: config.RunConfig) -> None:
+    """Warn of effects of a model, which the description of a side does not have."""
+    if run.effects:
+        named = ", ".join(dict.fromkeys(one.name for one in run.effects))
+        warnings.warn(
+            f"the model {run.name} has effects ({named}), which are left out of the description of a side: what is "
+            "found is relative to the survey without them; name a model without effects, whose beam is that of the "
+            "side.",
+            stacklevel=4,
+        )
 
 
 def _lacking(wanted: Sequence[str], a: set[str], b: set[str]) -> Iterator[NotCompared]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.comparison.description import SAMPLES, check_splits, in_full, orders_of, quiet, with_known_offsets
-from mcsim.comparison.missing import not_compared
+from mcsim.comparison.missing import not_compared, warn_of_effects
 from mcsim.comparison.result import NotCompared
 from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of
 from mcsim.comparison.sky_of_maps import sky_in
@@ -149,6 +149,7 @@ def read(
     whole: Survey | None = None
     orders: dict[str, int] = {}
     if run is not None:
+        warn_of_effects(run)
         run, orders = in_full(run)
         whole = survey(quiet(run), nthreads, orders=orders_of(run))
     sides = [_side(side, run, described, nthreads) for side in (a, b)]
@@ -191,6 +192,7 @@ def given(a: Given, b: Given, run: config.RunConfig, nthreads: int = 1) -> Compa
     """Compare maps given as arrays, by name or in the order of the run's, uK."""
     names = config.map_names(run)
     a, b = (_in_order(side, names) for side in (a, b))
+    warn_of_effects(run)
     run, orders = in_full(run)
     whole = survey(quiet(run), nthreads, orders=orders_of(run))
     sides = [dict(zip(names, side, strict=True)) for side in (a, b)]
@@ -218,7 +220,10 @@ def _in_order(side: Given, names: Sequence[str]) -> Sequence[NDArray[np.float64]
 def _model(
     a: str | Path, b: str | Path, model: str | Path | config.RunConfig | None
 ) -> tuple[config.RunConfig | None, str, bool]:
-    """Return the run that describes a side, if one does, its name in messages, and True if it is side B's own."""
+    """Return the run that describes a side, if one does, its name in messages, and True if it is side B's own.
+
+    A side's own description without effects comes before one that has some.
+    """
     if isinstance(model, config.RunConfig):
         return model, model.name, False
     found: str | Path | None = model
@@ -229,6 +234,9 @@ def _model(
     if found is None:
         return None, "", False
     run = config.load(found)
+    if run.effects and model is None and found == own[0] and (own[1] == b or Path(own[1]).is_file()):
+        other = config.load(own[1])
+        found, run = (found, run) if other.effects else (own[1], other)  # a description has none
     if run.map.grid != "healpix":
         raise InputError(f'{run.name} has map.grid = "{run.map.grid}" and so no pixels; set map.grid = "healpix".')
     return run, str(found), model is None and found == own[1] != own[0]

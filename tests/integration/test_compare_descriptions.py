@@ -290,6 +290,20 @@ def test_an_effect_of_side_a_is_taken_back_in_side_b(tmp_path, name, size, ampli
     assert words in str(found)
 
 
+def test_a_side_without_effects_describes_itself(tmp_path):
+    """Through the beam without its own effect, a side that is a fifth wider had another that is a quarter narrower."""
+    for name, size in (("plain", None), ("wide", 0.2), ("wider", 0.3)):
+        effect = "" if size is None else f'[[effect]]\nname = "beam_width"\nchannel = "W1"\namplitude = {size}\n'
+        (tmp_path / f"{name}.toml").write_text(DESCRIPTION.replace("20.0 }", "20.0, m_max = 4 }") + effect)
+    plain, wide, wider = (tmp_path / f"{name}.toml" for name in ("plain", "wide", "wider"))
+    found = mcsim.compare(wide, plain)
+    assert found.to_dict()["model_describes"] == {"W1": "b"}
+    width = next(one for one in found.channels[0].differences if one.name == "beam_width")
+    assert width.amplitude == pytest.approx(1.0 / 1.2 - 1.0, rel=0.05)
+    with pytest.warns(UserWarning, match=r"plain has effects \(beam_width\).*relative to the survey without them"):
+        mcsim.compare(wide, wider)
+
+
 def test_another_spectrum_is_no_cause_where_no_sample_can_be_elsewhere(tmp_path):
     """Under parallel transport a set must explain as much as where samples are known."""
     head = DESCRIPTION.partition("scan =")[0].replace("420.0", "300.0").replace("320.0", "240.0")
