@@ -259,8 +259,12 @@ class Prediction:
         return found
 
     def corrected(self, found: Set) -> Set:
-        """Return a set with its share measured sample by sample, and its values fitted again beside that."""
-        if self._pointing is None or self.pair.scene is None:
+        """Return a set with its share measured sample by sample, and its values fitted again beside that.
+
+        Without samples the responses of effects are simulated at their values, and are no longer linear.
+        """
+        simulated = any(type(difference).response is not Difference.response for difference, _ in found.members)
+        if self.pair.scene is None or (self._pointing is None and not simulated):
             return found
         if found.key not in self._exact:
             self._exact[found.key] = self._refined(found)
@@ -285,15 +289,16 @@ class Prediction:
 
     def _measured(self, found: Set) -> Set:
         base, pointing = self.pair.scene, self._pointing
-        if base is None or pointing is None or self._bare is None:
+        if base is None or self._bare is None:
             return found
         scene, correction = self.scene(found.members), np.zeros_like(self.pair.a)
         assert scene is not None
-        if scene is not base:
+        if scene is not base and pointing is not None:
             correction += scene.sampled(pointing, base.window) - self._sampled - (scene.maps() - self._bare)
         state = replace(self.state(()), scene=scene)
         for difference, value in found.members:
-            exact = difference.sampled(value, scene, self.pair)
+            way = difference.response if pointing is None else difference.sampled
+            exact = way(value, scene, self.pair)
             if exact is not None:
                 correction += exact - (difference.maps(self.pair.a, value, state) - self.pair.a)
         if not correction.any():
