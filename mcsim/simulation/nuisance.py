@@ -259,11 +259,11 @@ class DisturbedSurvey:
         """Return the errors of the gain that the run has itself, for all orders that beams can have, by channel."""
         found: dict[str, list[NDArray[np.complex128] | None]] = {}
         for channel in self.survey.making.channels:
-            rows = self._orders(channel) + 1
+            rows = self._orders(channel) + 2
             found[channel.name] = [
                 m.gain[:rows]
                 if m.gain is not None and len(m.gain) >= rows
-                else mean_gain(channel.effects, channel.site, Part.of(self.survey.config, place), rows - 1)
+                else mean_gain(channel.effects, channel.site, Part.of(self.survey.config, place), rows - 2)
                 for place, m in enumerate(channel.maps)
             ]
         return found
@@ -274,7 +274,7 @@ class DisturbedSurvey:
 
         Those of a nuisance with further parameters that are drawn are not linear, and take a pass for every draw.
         By nuisance, channel, and name in a map: one array for each map of the channel, shape (k, npix), of the gain
-        (k, orders + 1, npix).
+        (k, orders + 2, npix).
         """
         found = {}
         linear = [(number, one) for number, one in enumerate(self.nuisances) if not one.parameter_widths]

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
+import healpy
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,20 +38,29 @@ class Part:
 
 
 def mean_gain(acting: tuple[Effect, ...], site: Site, part: Part, orders: int = 0) -> NDArray[np.complex128] | None:
-    """Return the means of g e^{-i s psi} over the samples of every pixel, g the relative error of the gain.
+    """Return the means of g, g (dtheta + i dphi) and g e^{-i s psi} over the samples of every pixel.
 
-    By a pass over the pointing of part of the survey: shape (orders + 1, npix), the error itself at s = 0. None: no
-    error. A pixel that none of a part's rings crosses has the mean of all rings.
+    By a pass over the pointing of part of the survey: shape (orders + 2, npix), s from 1 to ``orders``. g is the
+    relative error of the gain, d the offset from the pixel's centre as :class:`mcsim.instrument.scan.Moments` has it.
+    None: no error. A pixel that none of a part's rings crosses has the means of all rings.
     """
     drifting = [effect for effect in acting if effect.gain(np.zeros(1), site) is not None]
     if not drifting:
         return None
 
-    def error(chunk: tod.Samples) -> Map:
+    def add(chunk: tod.Samples, sums: NDArray[np.float64]) -> None:
         terms = (g for effect in drifting if (g := effect.gain(chunk.time_s, site)) is not None)
-        return sum(terms, start=chunk.signal_uk)
+        _add_weighted(chunk.pixel, sum(terms, start=chunk.signal_uk), chunk.theta, chunk.phi, chunk.psi, orders, sums)
 
-    return _mean_of_samples(error, site.pointed(drifting[0].name), site, part, orders, angles=orders > 0)
+    means = _means(add, 4 + 2 * orders, site.pointed(drifting[0].name), site, part)
+    theta, phi = healpy.pix2ang(site.nside, np.arange(means.shape[1]))
+    x, y, z = means[1:4]
+    found = np.empty((orders + 2, means.shape[1]), dtype=np.complex128)
+    found[0] = means[0]
+    found[1].real = np.cos(theta) * (x * np.cos(phi) + y * np.sin(phi)) - np.sin(theta) * z
+    found[1].imag = y * np.cos(phi) - x * np.sin(phi)
+    found[2:] = means[4::2] + 1j * means[5::2]
+    return found
 
 
 def mean_signal(acting: tuple[Effect, ...], site: Site, part: Part) -> Map | None:
@@ -59,54 +69,56 @@ def mean_signal(acting: tuple[Effect, ...], site: Site, part: Part) -> Map | Non
     if not found:
         return None
 
-    def signal(chunk: tod.Samples) -> Map:
+    def add(chunk: tod.Samples, sums: NDArray[np.float64]) -> None:
         terms = (effect.signal(chunk.time_s, chunk.theta, chunk.phi, chunk.psi, site) for effect in found)
-        return sum(terms, start=chunk.signal_uk)
+        _add(chunk.pixel, sum(terms, start=chunk.signal_uk), sums)
 
-    return np.ascontiguousarray(_mean_of_samples(signal, site.pointed(found[0].name), site, part)[0].real)
+    return np.ascontiguousarray(_means(add, 1, site.pointed(found[0].name), site, part)[0])
 
 
-def _mean_of_samples(
-    values: Callable[[tod.Samples], Map],
-    pointing: Pointing,
-    site: Site,
-    part: Part,
-    orders: int = 0,
-    angles: bool = True,
-) -> NDArray[np.complex128]:
-    """Return the means of values times e^{-i s psi} over the samples of every pixel, zero in pixels without any.
+def _means(
+    add: Callable[[tod.Samples, NDArray[np.float64]], None], number: int, pointing: Pointing, site: Site, part: Part
+) -> NDArray[np.float64]:
+    """Return means over the samples of every pixel, shape (number, npix), zero in pixels without any.
 
-    Shape (orders + 1, npix). ``angles`` False: the values take times alone.
+    ``add`` adds samples to hits and as many sums, shape (npix, 1 + number).
     """
     grid = MapGrid(site.nside, site.frame, part.share)
-    sums = np.zeros((1 if part.rings is None else 2, grid.npix, 2 + 2 * orders))  # of one pixel side by side
-    for chunk in tod.samples(pointing.model, pointing.line, grid, angles=angles):
-        found = values(chunk)
-        _add(chunk.pixel, found, chunk.psi, orders, sums[-1])
+    own, whole = np.zeros((2, grid.npix, 1 + number))
+    for chunk in tod.samples(pointing.model, pointing.line, grid):
+        add(chunk, whole)
         if part.rings is not None:
-            own = tod.on_ring(chunk.time_s, pointing.model.spin_period_s, *part.rings)
-            _add(chunk.pixel[own], found[own], chunk.psi[own] if angles else chunk.psi, orders, sums[0])
-    chosen = np.where(sums[0, :, :1] > 0.0, sums[0], sums[-1])
-    mean = np.zeros((orders + 1, grid.npix), dtype=np.complex128)
-    mean.real = divided(chosen[:, 1::2].T, chosen[:, 0])
-    mean[1:].imag = divided(chosen[:, 2::2].T, chosen[:, 0])
-    return mean
+            for ring in tod.every_ring(pointing.model.spin_period_s, *part.rings)([chunk]):
+                add(ring, own)
+    chosen = np.where(own[:, :1] > 0.0, own, whole)
+    return divided(chosen[:, 1:].T, chosen[:, 0])
 
 
 @njit(nogil=True)
-def _add(pixel, value, psi, orders, sums):  # type: ignore[no-untyped-def]
-    """Add samples to hits and sums of values times e^{-i s psi}, powers of it by multiplication."""
+def _add(pixel, value, sums):  # type: ignore[no-untyped-def]
+    """Add samples to hits and sums of values."""
     for k in range(pixel.size):
-        own = sums[pixel[k]]
+        sums[pixel[k], 0] += 1.0
+        sums[pixel[k], 1] += value[k]
+
+
+@njit(nogil=True)
+def _add_weighted(pixel, value, theta, phi, psi, orders, sums):  # type: ignore[no-untyped-def]
+    """Add samples to hits and sums of values, of values times directions, and times e^{-i s psi}."""
+    for k in range(pixel.size):
+        own, sine = sums[pixel[k]], math.sin(theta[k])
         own[0] += 1.0
         own[1] += value[k]
+        own[2] += value[k] * sine * math.cos(phi[k])
+        own[3] += value[k] * sine * math.sin(phi[k])
+        own[4] += value[k] * math.cos(theta[k])
         if orders > 0:
-            cosine, sine = math.cos(psi[k]), math.sin(psi[k])
-            real, imag = value[k], 0.0
-            for s in range(1, orders + 1):
-                real, imag = real * cosine + imag * sine, imag * cosine - real * sine
-                own[2 * s] += imag
-                own[2 * s + 1] += real
+            turn = complex(math.cos(psi[k]), -math.sin(psi[k]))
+            turned = value[k] * turn
+            for s in range(orders):
+                own[5 + 2 * s] += turned.real
+                own[6 + 2 * s] += turned.imag
+                turned *= turn
 
 
 def gain_of(effect: Effect, site: Site, part: Part, orders: int = 0) -> NDArray[np.complex128]:

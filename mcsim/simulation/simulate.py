@@ -198,7 +198,7 @@ def _map_parts(
     flat = made.map(circular) if smooth else None
     whole = None
     if any(m.gain is not None for m in channel.maps):
-        whole = convolve.circular_map(seen, channel.response, nside, nthreads)
+        whole = convolve.CircularMaps(nside, survey.config.sky.lmax, nthreads)
     gradient = None
     terms = _expansion(channel)
     offsets: list[NDArray[np.float64]] = []
@@ -218,14 +218,28 @@ def _map_parts(
             draw = rng.generator(seed, realization, f"{own}/noise/{m.name}")
             extra.append(divided(effect.excess(m.moments.hits, draw), m.moments.hits))
         if m.gain is not None and whole is not None:
-            extra.append(m.gain[0].real * whole)
+            extra.append(_gained(channel, m, whole, convolve.circular_alm(seen, channel.response)))
         if m.signal_uk is not None:
             extra.append(m.signal_uk)
         difference = convolve.noncircular_map(spins, m.moments) if spins else None
         if m.gain is not None and seen_spins:
-            drifting = convolve.noncircular_map(seen_spins, replace(m.moments, w=m.gain[1:]))
+            drifting = convolve.noncircular_map(seen_spins, replace(m.moments, w=m.gain[2:]))
             difference = drifting if difference is None else difference + drifting
         yield m, MapParts(flat, sum(extra[1:], start=extra[0]) if extra else None, difference)
+
+
+def _gained(channel: Channel, m: SurveyMap, made: convolve.CircularMaps, circular: Alm) -> NDArray[np.float64]:
+    """Return what the error of the gain makes of a sky through the circular part of the beam, samples off the centres.
+
+    ``circular``: its a_lm; ``made``: its maps, which splits share.
+    """
+    assert m.gain is not None  # the caller looked
+    added = m.gain[0].real * made.map(circular)
+    if m.moments.dtheta is None:
+        return added
+    offset = systematics.spread_of(channel.effects) * m.gain[1]
+    off_centre = replace(m.moments, dtheta=offset.real, dphi=offset.imag)
+    return added + convolve.centroid_map(made.gradient(circular), off_centre)
 
 
 def _expansion(channel: Channel) -> Expansion | None:

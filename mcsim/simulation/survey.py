@@ -55,8 +55,8 @@ class SurveyMap:
     #: for; ``None``: no noise, or noise of differences
     noise_uk: NDArray[np.float64] | None
     pairs: mapmaking.DifferencingScan | None = None  #: pairs of pixels of a differencing scan; ``None``: any other scan
-    #: means over the samples of a pixel of g e^{-i s psi}, g the relative error of the gain, for s from 0 to the orders
-    #: of the beam, shape (orders + 1, npix); ``None``: no error
+    #: means over the samples of a pixel of g, the relative error of the gain, g (dtheta + i dphi), and g e^{-i s psi}
+    #: for s from 1 to the orders of the beam, shape (orders + 2, npix); ``None``: no error
     gain: NDArray[np.complex128] | None = None
     #: mean of what effects add to the samples of a pixel, shape (npix,); ``None``: nothing
     signal_uk: NDArray[np.float64] | None = None

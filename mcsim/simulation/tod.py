@@ -158,17 +158,12 @@ def white_noise(sigma0_uk: float, rng: np.random.Generator, factor: Map | None =
     return with_signal(noisy)
 
 
-def on_ring(time_s: Map, spin_period_s: float, number: int, index: int) -> NDArray[np.bool_]:
-    """Return True for samples of every ``number``-th ring from ring ``index`` on, shape (n,)."""
-    return np.asarray(np.floor(time_s / spin_period_s).astype(np.int64) % number == index)
-
-
 def every_ring(spin_period_s: float, number: int, index: int) -> Stage:
     """Return a stage that keeps every ``number``-th ring, one turn of the spin each, from ring ``index`` on."""
 
     def stage(stream: Iterable[Samples]) -> Iterator[Samples]:
         for chunk in stream:
-            own = on_ring(chunk.time_s, spin_period_s, number, index)
+            own = np.floor(chunk.time_s / spin_period_s).astype(np.int64) % number == index
             yield Samples(**{each.name: getattr(chunk, each.name)[own] for each in fields(chunk)})
 
     return stage
