@@ -188,12 +188,22 @@ class Search:
                 found[k] = mean
         return found
 
+    @cached_property
+    def finer(self) -> dict[int, int]:
+        """Return the power at higher degrees that a foreground has besides, of its pattern to the highest degree."""
+        powers = {
+            one.index: k for k, one in enumerate(self.grammar) if one.of_a_foreground and self.nulls[k] is not None
+        }
+        tops = {one.index: k for k, one in enumerate(self.grammar) if one.kind.startswith("degrees 0-")}
+        return {k: powers[index] for index, k in tops.items() if index in powers and self.nulls[k] is not None}
+
     def _evidences(self, falls: NDArray[np.float64], members: Sequence[int]) -> NDArray[np.float64]:
         """Return evidences from the falls of chi^2 of members, shape (members, n); not measured: NaN, and -inf.
 
         What a function of time is beyond its constant has a size of its own: most of a pulse is its mean, a monopole.
         That the covariance is estimated makes a fall beside a larger one, T, larger by 1 + T/N on average (Rao, Linear
-        Statistical Inference, 8c.4).
+        Statistical Inference, 8c.4). Light that channels share by their frequencies is a pattern and a power at higher
+        degrees: the more evident of the two has the evidence of both, beside noise of all degrees.
         """
         place, found = {k: row for row, k in enumerate(members)}, np.full(falls.shape, -np.inf)
         for row, k in enumerate(members):
@@ -205,6 +215,11 @@ class Search:
                 more = (falls[row] - falls[constant]) / (1.0 + np.maximum(falls[constant], 0.0) / len(self.simulations))
                 found[row] = evidence(falls[constant], 1) + evidence(more, structure.size - 1) - np.log(RARE)
                 found[row] -= _rarity(structure)
+        for pair in self.finer.items():
+            if all(k in place for k in pair):
+                both = found[[place[k] for k in pair]]
+                joint = np.where(both.min(axis=0) > 0.0, both.sum(axis=0), both)
+                found[[place[k] for k in pair]] = np.where(both == both.max(axis=0), joint, both)
         return found
 
     def finalists(self, values: Vector) -> list[int]:
@@ -222,7 +237,7 @@ class Search:
         if each[0].stage == "power":  # a monopole or dipole may be made of the rest of the sky
             made = (k for k, one in enumerate(self.grammar) if one.stage == "modulation")
             wanted += [k for k in made if self.nulls[k] is not None]
-        wanted += [self.constants[k] for k in order[:1] if k in self.constants]
+        wanted += [beside[k] for beside in (self.constants, self.finer) for k in order[:1] if k in beside]
         wanted += _firsts(order, [one.stage for one in each])
         wanted += [k for k in order if each[0].elsewhere(self.grammar[k]) or each[0].like(self.grammar[k])]
         beside = [k for k in order if each[0].beside(self.grammar[k])]
