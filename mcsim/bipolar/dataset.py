@@ -60,15 +60,21 @@ def biposh(alm: ArrayLike, alm2: ArrayLike | None = None, L_max: int = 2) -> xr.
         raise InputError(f"alm has lmax = {lmax}, alm2 has lmax = {lmax2}; give both up to the same lmax.")
     tables = estimator(L_max, lmax, both_orders=alm2 is not None)
     found = tables.modes
-    numbers = {key: ("mode", [getattr(mode, key) for mode in found]) for key in ("L", "M", "d", "parity")}
+    numbers = {"L": "bipolar degree", "M": "bipolar order", "d": "l2 - l1", "parity": "parity of l1 + l2 + L"}
+    labels = {
+        key: ("mode", [getattr(mode, key) for mode in found], {"long_name": text}) for key, text in numbers.items()
+    }
+    labels["mode"] = ("mode", [mode.name for mode in found], {"long_name": "BipoSH mode"})
     result = xr.Dataset(
         {
             "biposh": (("mode", "ell"), estimate(tables, x, None if alm2 is None else y)),
             "cl": ("ell", power_spectrum(x, y, lmax)),
         },
-        coords={"mode": [mode.name for mode in found], "ell": np.arange(lmax + 1), **numbers},
+        coords={"ell": ("ell", np.arange(lmax + 1), {"long_name": "degree l2"}), **labels},
         attrs={"biposh": CONVENTION, "normalisation": NORMALISATION, "alm": "healpy m-major order", "lmax": lmax},
     )
+    for name in ("ell", "L", "M", "d"):
+        result[name].attrs["units"] = "1"
     result["biposh"].attrs |= {"units": "uK^2", "long_name": "BipoSH coefficient A^{LM}_{l2-d,l2} at ell = l2"}
     result["cl"].attrs |= {"units": "uK^2", "long_name": "power spectrum C_l"}
     return result

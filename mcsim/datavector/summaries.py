@@ -46,6 +46,11 @@ class Element:
         return KINDS.get(self.kind, self.kind) + (f", order {self.L}" if self.kind == "beam" else "")
 
     @property
+    def unit(self) -> str:
+        """Return the unit of the number, "1" for one without."""
+        return UNITS.get(self.kind, "1")
+
+    @property
     def words(self) -> str:
         """Return what was measured, where and in which component, in words."""
         degrees = "" if self.ell is None else f"ℓ {self.ell[0]}" + f"–{self.ell[1]}" * (self.ell[1] > self.ell[0])
@@ -94,6 +99,20 @@ KINDS = {
     "gain": "residual × sky at the largest scales",
 }
 """What the elements of the data vector measure, in words."""
+
+UNITS = {
+    "monopole": "uK^-1",
+    "dipole": "uK^-1",
+    "plane": "uK^-1",
+    "square": "uK",
+    "common": "uK^-2",
+    "difference": "uK^-2",
+    "contrast": "uK^2",
+    "cross": "uK^-2",
+    "table": "uK^2",
+    "residual": "uK^-1",
+}
+"""Units of what has one: residuals of maps are over the variance of their noise, and so in uK^-1."""
 
 
 @dataclass(frozen=True)

@@ -313,27 +313,27 @@ class DiagnosisResult:
         Attribute ``result`` holds, as JSON, all that is no array.
         """
         rest = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
-        variables: dict[str, tuple[Any, ...]] = {
-            "z": ("element", self.z, {"long_name": "data less mean, over scatter", "units": "1"}),
-            "place_z": ("place", [p.z for p in self.places], {"long_name": "normal deviate of a group"}),
-            "place_p": ("place", [p.p for p in self.places], {"long_name": "p-value, look-elsewhere included"}),
+        values: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
+        values |= {name: [getattr(one, name) for one in self.candidates] for name in _OF_CANDIDATES}
+        values |= {"z": self.z, "place_z": [p.z for p in self.places], "place_p": [p.p for p in self.places]}
+        described = {**_DERIVED, **_ARRAYS, **_OF_CANDIDATES}
+        variables = {
+            name: (dims, values[name], {"units": units, "long_name": words})
+            for name, (dims, units, words) in described.items()
+            if values[name] is not None
         }
-        for name, (dims, words) in _ARRAYS.items():
-            if getattr(self, name) is not None:
-                variables[name] = (dims, getattr(self, name), {"long_name": words})
-        for name, words in _OF_CANDIDATES.items():
-            variables[name] = ("candidate", [getattr(one, name) for one in self.candidates], {"long_name": words})
-        return xr.Dataset(
-            variables,
-            coords={
-                "element": texts(one.name for one in self.elements),
-                "description": ("element", texts(one.words for one in self.elements)),
-                "candidate": texts(one.label for one in self.candidates),
-                "unit": ("candidate", texts(one.unit for one in self.candidates)),
-            }
-            | ({} if self.residual_maps is None else {"map": texts(self.maps)}),
-            attrs={"result": json.dumps(rest, default=asdict)},
-        )
+        labels: dict[str, tuple[str, list[str], str]] = {
+            "element": ("element", [one.name for one in self.elements], "element of the data vector"),
+            "description": ("element", [one.words for one in self.elements], "what an element measures"),
+            "element_unit": ("element", [one.unit for one in self.elements], "unit of an element"),
+            "candidate": ("candidate", [one.label for one in self.candidates], "candidate effect"),
+            "unit": ("candidate", [one.unit for one in self.candidates], "unit of the amplitude of a candidate"),
+            "place": ("place", [one.element.words for one in self.places], "element of a group that departs most"),
+        }
+        if self.residual_maps is not None:
+            labels["map"] = ("map", list(self.maps), "map")
+        coordinates = {name: (dim, texts(each), {"long_name": words}) for name, (dim, each, words) in labels.items()}
+        return xr.Dataset(variables, coordinates, {"result": json.dumps(rest, default=asdict)})
 
     def save(self, folder: str | Path) -> None:
         """Write ``verdict.json`` and ``diagnosis.zarr`` into a folder, made where it does not exist.
@@ -367,18 +367,29 @@ class DiagnosisResult:
         return cls(**arrays, **{key: TypeAdapter(hints[key]).validate_python(value) for key, value in rest.items()})
 
 
-_ARRAYS = {
-    "data": ("element", "data vector"),
-    "mean": ("element", "mean of the simulations, corrected by the time-ordered reference"),
-    "standard_deviation": ("element", "scatter of the simulations"),
-    "templates": (("element", "column"), "response per unit coordinate"),
-    "correlation": (("candidate", "other"), "canonical correlation of responses"),
-    "held_out_pvalues": ("simulation", "p-value of each simulation against the others"),
-    "calibration": ("draw", "smaller of the two p-values of draws of the model"),
-    "residual_maps": (("map", "pixel"), "residual over the scatter of simulations, RING"),
-    "residual_range": (("map", "end"), "smallest and largest rms of 95 % of the simulations"),
+_OF_ELEMENT = "see element_unit"
+_ARRAYS: dict[str, tuple[str | tuple[str, ...], str, str]] = {
+    "data": ("element", _OF_ELEMENT, "data vector"),
+    "mean": ("element", _OF_ELEMENT, "mean of the simulations, corrected by the time-ordered reference"),
+    "standard_deviation": ("element", _OF_ELEMENT, "scatter of the simulations"),
+    "templates": (("element", "column"), f"{_OF_ELEMENT}; per unit coordinate", "response per unit coordinate"),
+    "correlation": (("candidate", "other"), "1", "canonical correlation of responses"),
+    "held_out_pvalues": ("simulation", "1", "p-value of each simulation against the others"),
+    "calibration": ("draw", "1", "smaller of the two p-values of draws of the model"),
+    "residual_maps": (("map", "pixel"), "1", "residual over the scatter of simulations, RING"),
+    "residual_range": (("map", "end"), "1", "smallest and largest rms of 95 % of the simulations"),
 }
-_OF_CANDIDATES = {"amplitude": "fitted alone", "sigma": "standard error", "delta_chi2": "fall of chi^2"}
+_OF_CANDIDATES: dict[str, tuple[str | tuple[str, ...], str, str]] = {
+    "amplitude": ("candidate", "see unit", "fitted alone"),
+    "sigma": ("candidate", "see unit", "standard error"),
+    "delta_chi2": ("candidate", "1", "fall of chi^2"),
+}
+_DERIVED: dict[str, tuple[str | tuple[str, ...], str, str]] = {
+    "z": ("element", "1", "data less mean, over scatter"),
+    "place_z": ("place", "1", "normal deviate of a group"),
+    "place_p": ("place", "1", "p-value, look-elsewhere included"),
+}
+"""Dimensions, units and meaning of the variables of a dataset."""
 
 
 def _effect_json(effect: EffectResult) -> dict[str, Any]:

@@ -159,7 +159,6 @@ class Limits:
 
     def to_dataset(self) -> xr.Dataset:
         """Return table, correlations and Fisher matrix with names and units."""
-        labels = texts(one.label for one in self.effects)
         named = {
             "sigma": "standard error of the amplitude, rms over components",
             "amplitude_90_known": "amplitude detected if this effect alone is tested",
@@ -170,15 +169,20 @@ class Limits:
         for key, text in named.items():
             values = np.array([getattr(one, key) for one in self.effects])
             columns[key] = ("effect", values, {"units": "see unit", "long_name": text})
-        columns["unit"] = ("effect", texts(one.unit for one in self.effects))
+        columns["unit"] = ("effect", texts(one.unit for one in self.effects), {"long_name": "unit of the amplitudes"})
         error = np.array([one.error for one in self.effects])
         columns["sigma_relative_error"] = ("effect", error, {"units": "1", "long_name": "error from random probes"})
         shape = ("effect", "other"), self.correlation
         columns["correlation"] = (*shape, {"units": "1", "long_name": "largest canonical correlation of responses"})
         text = "Fisher information per unit of each component, nuisances marginalised"
         columns["fisher"] = (("component", "component_"), self.fisher, {"units": "1/units^2", "long_name": text})
-        names = texts(self.components)
-        coordinates = {"effect": labels, "other": labels, "component": names, "component_": names}
+        labels, names = texts(one.label for one in self.effects), texts(self.components)
+        coordinates = {
+            "effect": ("effect", labels, {"long_name": "effect"}),
+            "other": ("other", labels, {"long_name": "the other effect of a correlation"}),
+            "component": ("component", names, {"long_name": "linear component of an effect"}),
+            "component_": ("component_", names, {"long_name": "the other component of the matrix"}),
+        }
         attributes = {"model": self.model, "conventions": self.conventions, "method": self.method, "tests": self.tests}
         attributes["unknowns"] = self.unknowns
         return xr.Dataset(columns, coordinates, attributes)

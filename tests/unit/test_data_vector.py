@@ -34,6 +34,26 @@ def test_a_mean_is_weighted_with_the_inverse_variance_of_its_own_map_alone(analy
     np.testing.assert_allclose(found, [0.0, expected, 0.0, 0.0], rtol=1e-5, atol=1e-5 * expected)
 
 
+def test_elements_scale_as_their_units_say(analysis) -> None:
+    """A sky, a dipole, noise and maps of twice the temperature: 2 to the power of µK in the unit."""
+    factor, maps = 2.0, list(simulate.maps(survey(analysis.run), 0))
+    table = two_channels("scaled", sigma0_uk=factor * 30.0)
+    cl = survey(analysis.run).cl
+    table["sky"] = {**table["sky"], "spectrum": factor**2 * cl, "dipole_uk": factor * 3364.5}
+    scaled = analysis_of(config.load(table), without=tuple(catalogue()), settings=analysis.settings)
+    power = {"uK^-2": -2, "uK^-1": -1, "1": 0, "uK": 1, "uK^2": 2}
+    for one, other, elements in (
+        (analysis.data_vector(maps), scaled.data_vector([factor * m for m in maps]), analysis.elements),
+        (
+            analysis.data_vector(maps, slices=True)[len(analysis.elements) :],
+            scaled.data_vector([factor * m for m in maps], slices=True)[len(analysis.elements) :],
+            analysis.slices,
+        ),
+    ):
+        expected = np.array([factor ** power[element.unit] for element in elements])
+        np.testing.assert_allclose(other, expected * one, rtol=1e-6, atol=1e-9)
+
+
 def test_ranges_end_at_the_edges_and_the_widest_are_halved() -> None:
     found = ranges_within(EDGES, 8)
     assert len(found) == 8

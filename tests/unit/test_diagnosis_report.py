@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from datasets import undescribed
 from mcsim import config, systematics
 from mcsim.datavector import bipolar_scan, localisation
 from mcsim.datavector.candidate import Candidate, numbered
@@ -365,6 +366,7 @@ def test_result_comes_back_from_disk_as_it_was(diagnoses, pages, tmp_path, kind)
     one.save(tmp_path)
     again = DiagnosisResult.open(tmp_path)
     assert again.to_dataset().identical(one.to_dataset())
+    assert undescribed(one.to_dataset()) == []
     assert again.to_json() == json.loads((tmp_path / "verdict.json").read_text())
     for field in fields(one):
         if field.name not in ("candidates", "residual_maps"):  # with NaN

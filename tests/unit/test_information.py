@@ -14,6 +14,7 @@ from scipy.linalg import cho_factor, cho_solve
 from typer.testing import CliRunner
 
 import mcsim
+from datasets import undescribed
 from mcsim import config, systematics
 from mcsim.bipolar import estimate, estimator
 from mcsim.bipolar.theory import fisher_information
@@ -380,6 +381,7 @@ def test_limits_are_written_and_say_what_they_are(tmp_path) -> None:
     written = json.loads((tmp_path / "out" / "limit.json").read_text())
     assert written["effects"][0]["sigma"] == found.effects[0].sigma
     assert written["effects"][0]["similar"]["channel"] == "W1"
+    assert undescribed(found.to_dataset()) == []
     with xr.open_zarr(tmp_path / "out" / "limit.zarr") as stored:
         np.testing.assert_array_equal(stored.fisher, found.fisher)
     assert (tmp_path / "out" / "limit.png").stat().st_size > 10_000

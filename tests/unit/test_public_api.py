@@ -16,6 +16,7 @@ import pytest
 from distributed import Client, LocalCluster
 
 import mcsim
+from datasets import undescribed
 from mcsim import config
 from mcsim.bipolar import estimate, estimator
 from mcsim.ensemble import plan
@@ -243,6 +244,7 @@ def test_biposh_is_the_estimator_with_labels(sky, pair) -> None:
 
 def test_biposh_selects_as_plain_xarray_does(sky) -> None:
     found = mcsim.biposh(sky)
+    assert undescribed(found) == []
     quadrupole = found.where(found.L == 2, drop=True)
     assert set(quadrupole.L.values) == {2}
     assert found.sel(mode="L2M0d0").biposh.shape == (LMAX + 1,)
