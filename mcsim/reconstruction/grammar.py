@@ -50,6 +50,8 @@ IN_MAPS = ("beam", "elsewhere", "noise", "square", "cube", "rotation")
 
 ANY = f"1-{HARMONICS}"  #: of a wave in any way: a constant and all harmonics
 
+LINE = "line "  #: begins the kind of what is along the line of sight of a channel, whose name follows
+
 LOWEST = "degrees 0-1"  #: kind of a monopole and a dipole
 ALSO_COMMON = ("monopole", "dipole", LOWEST)
 """Patterns that all channels may have alike: in the sky itself, but skies of a model have none of them."""
@@ -95,7 +97,7 @@ class Structure:
     def extends(self, other: "Structure") -> bool:
         """Return True for what has more than its mean, in time or on the sky, if that is the other one."""
         longer = self.kind in ("elongation", "Galaxy") or self.kind.startswith(("degrees", "latitude", "step"))
-        if not longer and not self.kind.endswith(ANY):
+        if not longer and not self.in_any_way:
             return False
         stage = {"added": ("added", "power")}.get(self.stage, (self.stage,))
         same = (self.acts_on, self.channel, self.split, self.index)
@@ -107,6 +109,11 @@ class Structure:
         """Return True if another varies with the same in the same maps, whatever it multiplies and how often."""
         mine, theirs = ((one.stage, one.frame, one.kind.split()[0], *one.says[4:]) for one in (self, other))
         return mine == theirs
+
+    @property
+    def in_any_way(self) -> bool:
+        """Return True for a constant and all harmonics of a wave."""
+        return self.kind.endswith(ANY) and not self.kind.startswith(LINE)
 
     @property
     def choice(self) -> tuple[str | None, ...]:
@@ -170,6 +177,8 @@ class Structure:
 
 
 def _briefly(kind: str) -> list[str]:
+    if kind.startswith(LINE):
+        return [kind]
     if kind.startswith(HISTORIES):
         return [HISTORIES[0]]
     return kind.split()[: 1 if kind.startswith(("degrees", "crossing", "source")) else 2]
@@ -263,7 +272,7 @@ def _forms(scene: Scene, split: str, kept: list[int]) -> Iterator[_Form]:
         if all(name in scene.views[i].elsewhere for i in kept):
             for on in ACTED_ON[:2]:
                 yield "elsewhere", on, "spacecraft", name, [("elsewhere", name, on)], None
-            if name.startswith("line"):
+            if name.startswith(LINE):
                 yield "added", "dipole", "spacecraft", name, lobe, scene.elsewhere[view.channel][name][:, :3]
     for on in ("", *ACTED_ON) if split == ALIKE else PERIODIC:
         yield from _timed(scene, view, on)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mcsim.reconstruction.forms import FORMS, Form, Towards
-from mcsim.reconstruction.grammar import ALIKE, ANY, LOBE, OPPOSITE, Structure
+from mcsim.reconstruction.grammar import ALIKE, LOBE, OPPOSITE, Structure
 from mcsim.reconstruction.scores import ELSEWHERE, MONTH, Scene
 from mcsim.reconstruction.time_functions import HISTORIES
 from mcsim.support.arrays import Vector
@@ -192,7 +192,7 @@ def _numbers(structure: Structure, theta: Vector) -> tuple[float, ...]:
     found = theta if structure.mix is None else structure.mix.T @ theta
     if structure.kind == "elongation":  # of cosines alone
         found = np.delete(np.stack([found, np.zeros_like(found)], axis=1).ravel(), 1)
-    if structure.kind.startswith(("elongation", "crossing")) or structure.kind.endswith(ANY):  # a constant has no sine
+    if structure.kind.startswith(("elongation", "crossing")) or structure.in_any_way:  # a constant has no sine
         return float(found[0]) / CONSTANT, 0.0, *map(float, found[1:])
     lower = {"dipole": 1, "quadrupole": 4}.get(structure.kind, 0) if structure.frame != "Sun" else 0
     return tuple(map(float, np.append(np.zeros(lower), found)))

@@ -15,7 +15,7 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.reconstruction.grammar import ALIKE, ANY, LOWEST, MEANS, Structure
+from mcsim.reconstruction.grammar import ALIKE, LOWEST, MEANS, Structure
 from mcsim.reconstruction.scores import INDICES
 from mcsim.sphere import real
 from mcsim.stats.gaussian import SimulatedGaussian
@@ -241,7 +241,7 @@ class Search:
         wanted += _firsts(order, [one.stage for one in each])
         wanted += [k for k in order if each[0].elsewhere(self.grammar[k]) or each[0].like(self.grammar[k])]
         beside = [k for k in order if each[0].beside(self.grammar[k])]
-        wanted += _firsts(beside, [(self.grammar[k].acts_on, self.grammar[k].kind.endswith(ANY)) for k in beside])
+        wanted += _firsts(beside, [(self.grammar[k].acts_on, self.grammar[k].in_any_way) for k in beside])
         wanted += [k for k in order if values[order[0]] - values[k] < NEAR]
         wanted += _firsts(order, [(one.stage, one.acts_on, one.frame) for one in each])
         chosen = _firsts(wanted, [self.grammar[k].choice or k for k in wanted])
@@ -410,7 +410,8 @@ def _firsts(order: Sequence[int], labels: Sequence[Hashable]) -> list[int]:
 def _rarity(structure: Structure) -> float:
     """Return the logarithm of the prior odds against a structure, beside one of the common kind."""
     part = structure.stage in ("gain", "square", "elsewhere") and structure.acts_on != "sky and dipole"
-    odd = part or structure.stage == "cube" or structure.kind.endswith("low l")
+    halo = structure.stage == "beam" and structure.kind.endswith("low l")
+    odd = part or structure.stage == "cube" or halo
     rare = (structure.split != ALIKE) + odd + (structure.stage == "elsewhere")
     tried = structure.tried * (1.0 if structure.index is None else len(INDICES))
     return rare * float(np.log(RARE)) + float(np.log(tried))

@@ -3,6 +3,7 @@
 import ast
 import tomllib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from mcsim import config
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import model_of
 from mcsim.reconstruction import simulated_scores, words
-from mcsim.reconstruction.grammar import structures
+from mcsim.reconstruction.grammar import ALIKE, Structure, structures
 from mcsim.reconstruction.plugin import Plugin, plugin
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -25,6 +26,23 @@ def test_a_file_says_how_it_is_used_whatever_the_channel_is_called(channel):
         (said, *_) = ast.parse(text).body
         (table,) = tomllib.loads(said.value.value.split("\n\n")[2])["effect"]
         assert table.get("channel") == (channel if base == "BeamOrder" else None)
+
+
+@pytest.mark.parametrize("names", [("W 1", "W 2"), ("W 1-4", "W 2-4")])
+def test_lines_of_sight_are_told_apart_whatever_the_channels_are_called(names):
+    """Of the lines of two channels each is its own, and none is a wave because its name ends in a range."""
+    rows = np.array([[0], [1], [2]])
+    found = [
+        Structure("added", "dipole", "spacecraft", f"line {name}", "V1", ALIKE, None, rows, np.ones(1))
+        for name in names
+    ]
+    level = replace(found[0], stage="power", acts_on="", frame="", kind="monopole")
+    assert not found[0].like(found[1])
+    assert found[0].like(found[0])
+    assert not replace(found[0], acts_on="").extends(replace(level, acts_on=""))
+    scene = SimpleNamespace(channels=("V1", *names), splits=("half1", "half2"), timed=True, frame="ecliptic")
+    (made, other) = (plugin("unlisted_1", one, np.array([0.1, 0.2, 0.3]), scene) for one in found)
+    assert made.values["coefficients"] == other.values["coefficients"] == (0.1, 0.2, 0.3)
 
 
 def test_foregrounds_are_in_all_maps_but_those_of_a_component_separation():
