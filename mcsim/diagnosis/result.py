@@ -19,7 +19,7 @@ from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.ensemble.store import write_dataset
 from mcsim.errors import InputError
-from mcsim.reconstruction.result import Reconstructed
+from mcsim.reconstruction.result import HEAD, Reconstructed
 from mcsim.stats.excess import HeldOut, Measured, excess_of
 from mcsim.stats.look_elsewhere import GlobalTest
 from mcsim.support.arrays import Vector, texts
@@ -338,13 +338,19 @@ class DiagnosisResult:
     def save(self, folder: str | Path) -> None:
         """Write ``verdict.json`` and ``diagnosis.zarr`` into a folder, made where it does not exist.
 
-        Reconstructed effects are written there too, a Python file each.
+        Reconstructed effects are written there too, a Python file each; those of an earlier verdict that this one does
+        not use are deleted.
         """
         target = Path(folder)
         target.mkdir(parents=True, exist_ok=True)
-        for one in self.unlisted or ():
-            if one.file is not None:
-                (target / f"{one.name}.py").write_text(one.file, encoding="utf-8")
+        written = {one.name: one.file for one in self.unlisted or () if one.file is not None}
+        used = {one.name for one in self.candidates}
+        used |= {Path(one["name"]).stem for one in json.loads(self.configuration).get("effect") or ()}
+        for path in target.glob("unlisted_*.py"):
+            if path.stem not in used | set(written) and HEAD in path.read_text(encoding="utf-8", errors="replace"):
+                path.unlink()
+        for name, text in written.items():
+            (target / f"{name}.py").write_text(text, encoding="utf-8")
         write_dataset(self.to_dataset(), target / STORE)
         (target / "verdict.json").write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n")
 

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import count, islice, pairwise
+from pathlib import Path
 
 import healpy
 import numpy as np
@@ -23,7 +24,7 @@ from mcsim.reconstruction.grammar import ALIKE, Structure
 from mcsim.reconstruction.plugin import Plugin, plugin
 from mcsim.reconstruction.result import NSIDE, WORDS, Reconstructed
 from mcsim.reconstruction.scores import Scene
-from mcsim.reconstruction.search import Response, Search
+from mcsim.reconstruction.search import MOST, Response, Search
 from mcsim.reconstruction.simulated_scores import filtered, scene_for, scores_of_maps, search_of, with_peaks
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit
@@ -165,6 +166,13 @@ class Reconstruction:
         return Simulated(maps[0], np.stack(scores_), x)
 
     @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Return names of effects that neither the run nor the library has: those of earlier files are in use."""
+        analysis = self.data.context.analysis
+        taken = {Path(one.name).stem for one in analysis.run.effects} | {name for name, _ in analysis.library}
+        return tuple(islice((name for k in count(1) if (name := f"unlisted_{k}") not in taken), MOST))
+
+    @cached_property
     def before(self) -> Simulated:
         """Return the same without effects."""
         return self.simulated([], tested=True)
@@ -186,7 +194,7 @@ class Reconstruction:
             structure = self.search.grammar[chosen[-1]]
             ((theta, covariance),) = self.search.fit([structure], rest)
             fit = self._kept.get(chosen[-1], (theta,))[0], covariance
-            made = plugin(f"unlisted_{len(chosen)}", structure, fit[0], self.scene)
+            made = plugin(self.names[len(chosen) - 1], structure, fit[0], self.scene)
             self._fitted[key] = ([*fits, fit], *self._calibrated(chosen, [*plugins, made]))
         return self._fitted[key]
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from mcsim.reconstruction.forms import FORMS, Form, Towards
 from mcsim.reconstruction.grammar import ALIKE, LOBE, OPPOSITE, Structure
+from mcsim.reconstruction.result import HEAD
 from mcsim.reconstruction.scores import ELSEWHERE, MONTH, Scene
 from mcsim.reconstruction.time_functions import HISTORIES
 from mcsim.support.arrays import Vector
@@ -18,7 +19,7 @@ CONSTANT = float(np.sqrt(4.0 * np.pi))  #: real coefficient of degree 0 of a map
 
 _FILE = '''"""{sentence}
 
-Written by mcsim diagnose from the data: no physics. Use it in a run,
+{head} Use it in a run,
 
     [[effect]]
     name = "{name}.py"{channel}
@@ -70,7 +71,7 @@ class Plugin:
         toml = f"'{of}'" if '"' in of and "'" not in of else json.dumps(of, ensure_ascii=False)
         channel = "" if self.kind().scope == "common" else f"\n    channel = {toml}"
         title = "".join(part.capitalize() for part in self.name.split("_"))
-        text = {"sentence": _quoted(sentence), "name": self.name, "base": self.base, "title": title}
+        text = {"head": HEAD, "sentence": _quoted(sentence), "name": self.name, "base": self.base, "title": title}
         return _FILE.format(**text, channel=_quoted(channel), body="\n".join(lines))
 
 

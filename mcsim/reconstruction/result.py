@@ -7,6 +7,8 @@ from mcsim.support.numbers import measured, p_equals
 
 NSIDE = 16  #: of the pictures
 
+HEAD = "Written by mcsim diagnose from the data: no physics."  #: in the file of every effect
+
 WORDS = ("stage", "acts_on", "frame", "kind", "channel", "split", "index", "says")  #: what a structure says
 
 

@@ -26,6 +26,7 @@ from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import attribute
+from mcsim.reconstruction.result import HEAD
 from mcsim.stats.detection import confusion, snr_needed
 from mcsim.stats.excess import HeldOut, Measured
 from mcsim.stats.gaussian import SimulatedGaussian, held_out_pvalues, residual_pvalue
@@ -382,6 +383,20 @@ def test_result_comes_back_from_disk_as_it_was(diagnoses, pages, tmp_path, kind)
 def test_a_folder_without_a_diagnosis_is_named(tmp_path):
     with refused(tmp_path.name):
         DiagnosisResult.open(tmp_path)
+
+
+def test_effects_of_an_earlier_verdict_are_deleted_unless_they_are_used(diagnoses, tmp_path):
+    """Those that the run names, or that are candidates, are; a file that somebody else wrote stays."""
+    one = diagnoses["effect"]
+    plain = json.loads(one.configuration) | {"effect": [{"name": str(tmp_path / "unlisted_1.py"), "channel": "V"}]}
+    given = replace(one.candidates[0], name="unlisted_2")
+    used = replace(one, configuration=json.dumps(plain), candidates=(given, *one.candidates[1:]))
+    for k in range(1, 5):
+        (tmp_path / f"unlisted_{k}.py").write_text("mine" if k == 3 else HEAD)
+    used.save(tmp_path)
+    assert sorted(path.stem for path in tmp_path.glob("*.py")) == ["unlisted_1", "unlisted_2", "unlisted_3"]
+    one.save(tmp_path)
+    assert sorted(path.stem for path in tmp_path.glob("*.py")) == ["unlisted_3"]
 
 
 def test_tables_of_spectra_have_no_map_pictures(diagnoses, tmp_path):

@@ -102,3 +102,12 @@ def test_a_half_whose_fit_its_own_response_contradicts_measures_nothing(turned, 
     found = reduction_of(data, SimpleNamespace(attribution=attribution, templates=t, candidates=[candidate]))
     assert (found is not None) == measured
     assert not measured or found.achieved.value == pytest.approx(1.0, abs=0.1)
+
+
+def test_names_of_effects_that_a_run_or_a_library_has_are_not_given_again():
+    """An earlier description that the run names would be written over, and the run changed."""
+    run = SimpleNamespace(effects=(SimpleNamespace(name="/out/unlisted_1.py"), SimpleNamespace(name="gain_drift")))
+    analysis = SimpleNamespace(run=run, library=(("unlisted_3", None), ("calibration", None)))
+    data = SimpleNamespace(context=SimpleNamespace(analysis=analysis))
+    made = unlisted.Reconstruction(data, None, None, np.zeros(0))
+    assert made.names == ("unlisted_2", "unlisted_4", "unlisted_5")
