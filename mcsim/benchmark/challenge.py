@@ -40,7 +40,7 @@ STRONGER = 1.5  #: largest ratio of the simulated to the drawn expected S/N
 def make(
     settings: Settings, folder: str | Path, cases: int, seed: int, *, workers: Workers | None = None, quiet: bool = True
 ) -> Path:
-    """Make those of a number of cases of a challenge that are not there yet; return the folder.
+    """Make those of a number of cases of a challenge that are not there, or not whole; return the folder.
 
     It gets ``cases/case-NNN`` (maps, model.toml, question.json, SEAL), ``keys/case-NNN.json`` and ``challenge.json``. A
     folder can be filled in several calls, and a call that was interrupted repeated. The seed of the draws is kept among
@@ -62,7 +62,8 @@ def make(
     names = [f"case-{number:03d}" for number in range(cases)]
     files.check_keys(target, names)
     settings.check(target, seed)
-    missing = [number for number, case in enumerate(names) if not files.is_finished(target, case)]
+    own = file_names(settings.model).values()
+    missing = [number for number, case in enumerate(names) if not files.is_whole(target, case, own)]
     if not missing:
         settings.write(target, seed)
         return target
@@ -89,7 +90,7 @@ def _truth(drawn: Drawn, seed: int, number: int, sampled_share: float) -> Truth:
 def make_case(settings: Settings, folder: Path, truth: Truth) -> None:
     """Make maps, seal and key of one case: the key first; the folder of the maps, complete, last.
 
-    It takes the place of one that has lost its seal.
+    It takes the place of one that has lost its seal, or another of its files.
     """
     case, run = truth.case, settings.model
     names = file_names(run)
@@ -104,10 +105,10 @@ def make_case(settings: Settings, folder: Path, truth: Truth) -> None:
         for name, map_uk in maps_of(run, truth, settings.out_of_library):
             write_map(scratch / names[name], map_uk, config.prepared_grid(run)[1], [POINTING[truth.sampled]])
         plain = {**config.to_dict(run), "name": case}
-        (scratch / "model.toml").write_text(tomli_w.dumps(_without_none(plain)), encoding="utf-8")
+        (scratch / files.MODEL).write_text(tomli_w.dumps(_without_none(plain)), encoding="utf-8")
         (scratch / files.QUESTION).write_text(json.dumps({"without": list(truth.without)}) + "\n")
         (scratch / files.SEAL).write_text(f"{files.key_hash(folder, case)}  {files.KEYS}/{case}.json\n")
-        if not files.is_finished(folder, case):
+        if not files.is_whole(folder, case, names.values()):
             shutil.rmtree(folder / files.MAPS / case, ignore_errors=True)
 
 
@@ -162,7 +163,7 @@ def run(folder: str | Path, *, workers: Workers | None = None, quiet: bool = Tru
     InputError if the folder holds no challenge, or cases that have keys are lost.
     """
     target = Path(folder)
-    missing = [case for case in files.all_cases(target) if not (target / files.VERDICTS / case).is_dir()]
+    missing = [case for case in files.all_cases(target) if not files.is_answered(target, case)]
     settings = Settings.read(target)
     if missing:
         # Cases of one library follow each other, so that a worker seldom changes its library.

@@ -12,11 +12,11 @@ from mcsim import config, systematics
 from mcsim.benchmark.case import Member, Prior, Truth
 from mcsim.benchmark.out_of_library import load
 from mcsim.errors import InputError
-from mcsim.support.folders import write_once
+from mcsim.support.folders import not_a_file, write_once
 
 NO_KEY = "restore it, or make another challenge in a new folder"
 SETTINGS, MAPS, KEYS, SEAL, VERDICTS = "challenge.json", "cases", "keys", "SEAL", "verdicts"
-QUESTION = "question.json"
+MODEL, QUESTION = "model.toml", "question.json"
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Settings:
     including: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Raise InputError for a share outside 0 to 1, an effect that there is not, or one both in and out of it."""
+        """Raise InputError for a share or number that cannot be, or an effect that is unknown, or in and out of it."""
         proposed = {systematics.get(name).name for name in self.including}
         own = set() if self.out_of_library is None else set(load(self.out_of_library))
         if both := sorted(proposed & own):
@@ -49,6 +49,9 @@ class Settings:
             )
         if not 0.0 <= self.sampled_share <= 1.0:
             raise InputError(f"a share of {self.sampled_share:g} made sample by sample is none; give 0 to 1.")
+        count: object = self.simulations  # of a file, whatever is in it
+        if count is not None and (isinstance(count, bool) or not isinstance(count, int)):
+            raise InputError(f"simulations = {count!r} is no whole number; give one, or none.")
 
     def write(self, folder: Path, seed: int) -> None:
         """Write the settings, and the seed among the keys; InputError, with what differs, if the folder has others."""
@@ -81,14 +84,17 @@ class Settings:
 
     @classmethod
     def read(cls, folder: Path) -> "Settings":
-        """Read what :meth:`write` wrote; InputError if that is not possible."""
-        plain = read_json(folder / SETTINGS, "make the challenge with mcsim challenge make")
+        """Read what :meth:`write` wrote; InputError, which names the file, if that is not possible."""
+        path = folder / SETTINGS
+        plain = read_json(path, "make the challenge with mcsim challenge make")
         try:
             prior, share = Prior(**plain["prior"]), plain["sampled_share"]
             including = tuple(plain.get("including", ()))
             return cls(config.load(plain["model"]), prior, share, None, plain["simulations"], including)
-        except (KeyError, TypeError) as error:
-            raise InputError(f"{folder / SETTINGS} lacks what a challenge needs ({error}); make it again.") from error
+        except (KeyError, TypeError, AttributeError) as error:
+            raise InputError(f"{path} lacks what a challenge needs ({error}); make it again.") from error
+        except InputError as error:
+            raise InputError(f"{path}: {error} Restore the file, or make it again.") from error
 
 
 def _changes(old: Any, text: str) -> list[str]:
@@ -181,6 +187,19 @@ def finished_cases(folder: Path) -> list[str]:
 def is_finished(folder: Path, case: str) -> bool:
     """Return True if the maps of a case are complete: the seal is written last."""
     return (folder / MAPS / case / SEAL).is_file()
+
+
+def is_whole(folder: Path, case: str, names: Iterable[str]) -> bool:
+    """Return True if a case is finished, and none of its files, the maps of these names among them, is lost."""
+    own = folder / MAPS / case
+    return is_finished(folder, case) and all((own / name).is_file() for name in (*names, MODEL, QUESTION))
+
+
+def is_answered(folder: Path, case: str) -> bool:
+    """Return True if a case has a verdict; InputError for a file in the place of its folder."""
+    path = folder / VERDICTS / case
+    not_a_file(path)
+    return path.is_dir()
 
 
 def all_cases(folder: Path) -> list[str]:

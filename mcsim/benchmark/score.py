@@ -10,7 +10,17 @@ import numpy as np
 from mcsim.benchmark import report
 from mcsim.benchmark.bayes import BayesClassifier, facts
 from mcsim.benchmark.case import Drawn, Prior, Record, Truth, pulls
-from mcsim.benchmark.folder import MAPS, QUESTION, VERDICTS, Settings, all_cases, open_key, question, read_json
+from mcsim.benchmark.folder import (
+    MAPS,
+    QUESTION,
+    VERDICTS,
+    Settings,
+    all_cases,
+    is_answered,
+    open_key,
+    question,
+    read_json,
+)
 from mcsim.benchmark.models import EffectsLibrary, LinearModel, learned_model, linear_model, simulated, workers_of
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.benchmark.summary import ALPHA, Power, Score
@@ -25,7 +35,7 @@ from mcsim.sphere import rng
 from mcsim.stats.detection import power
 from mcsim.stats.look_elsewhere import GlobalTest, global_test
 from mcsim.support.arrays import Matrix, Vector
-from mcsim.support.folders import user_path, writable
+from mcsim.support.folders import not_a_file, user_path, writable
 
 CASES_PER_TASK = 20
 DETECTIONS = 4000  #: draws of single effects that are tested for detection alone
@@ -41,8 +51,9 @@ def score(folder: str | Path, *, workers: Workers | None = None, quiet: bool = T
     there is no verdict, or one cannot be read, or a key is not the sealed one, or cases that have keys are lost.
     """
     target = Path(folder)
+    not_a_file(target / "score")
     made = all_cases(target)
-    cases = [case for case in made if (target / VERDICTS / case).is_dir()]
+    cases = [case for case in made if is_answered(target, case)]
     if not cases:
         raise InputError(f"{folder} has no verdicts; run mcsim challenge run {folder} first.")
     settings, truths = Settings.read(target), [open_key(target, case) for case in cases]

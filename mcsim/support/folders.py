@@ -34,9 +34,10 @@ def real_path(path: Path) -> Path:
 def appearing(path: Path) -> Iterator[Path]:
     """Yield a scratch folder beside ``path``; rename it to ``path`` at the end, delete it if the block fails.
 
-    If another process was faster, its folder stays.
+    If another process was faster, its folder stays. InputError for a file in the place of a folder.
     """
     path = real_path(path)
+    not_a_file(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
@@ -49,6 +50,15 @@ def appearing(path: Path) -> Iterator[Path]:
                 raise
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def not_a_file(path: Path) -> None:
+    """Raise InputError if a file stands where a folder is to be, or one of those that it is in."""
+    for one in (path, *path.parents):
+        if one.exists():
+            if not one.is_dir():
+                raise InputError(f"{one} is a file, where a folder is needed; move it away.")
+            return
 
 
 def is_full(error: BaseException | None) -> bool:

@@ -103,6 +103,27 @@ def test_a_lost_case_is_made_again_with_the_same_key(challenge, tmp_path):
     np.testing.assert_array_equal(healpy.read_map(case / "W1_half1.fits", dtype=float), maps)
 
 
+@pytest.mark.parametrize("lost", ["W1_half2.fits", "model.toml", "question.json"])
+def test_a_lost_file_of_a_sealed_case_is_made_again(challenge, lost):
+    folder, _ = challenge
+    case = folder / "cases" / "case-001"
+    before = {name: (case / name).read_bytes() for name in ("SEAL", lost)}
+    (case / lost).unlink()
+    made(folder)
+    assert {name: (case / name).read_bytes() for name in before} == before
+
+
+def test_a_file_in_the_place_of_a_case_is_named(challenge, tmp_path):
+    folder, _ = challenge
+    case = folder / "cases" / "case-001"
+    case.rename(tmp_path / "lost")
+    case.write_text("")
+    with refused(case):
+        made(folder)
+    case.unlink()
+    (tmp_path / "lost").rename(case)
+
+
 def test_cases_are_what_a_diagnosis_reads(challenge):
     folder, _ = challenge
     fiducial = config.load(folder / "cases" / "case-000" / "model.toml")

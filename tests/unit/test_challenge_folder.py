@@ -1,5 +1,6 @@
 """The folder of a challenge: settings, keys, seals, and what is refused of them."""
 
+import json
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -200,8 +201,38 @@ def test_a_folder_that_is_no_challenge_is_refused(folder, tmp_path):
     for text in ("{}", "no settings", '{"model": 3, "prior": {}, "sampled_share": 0.5, "simulations": null}'):
         write_whole(folder / SETTINGS, text)
         for task in (run, score):
-            with pytest.raises(InputError):
+            with refused(folder / SETTINGS):
                 task(folder, workers=0)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("model", {"schema": 1}),
+        ("prior", {"none": "x"}),
+        ("prior", []),
+        ("including", ["gain_spni"]),
+        ("sampled_share", 7),
+        ("simulations", "many"),
+    ],
+)
+def test_damaged_settings_name_their_file(folder, key, value):
+    path = folder / SETTINGS
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    with refused(path):
+        Settings.read(folder)
+
+
+@pytest.mark.parametrize(
+    ("place", "task"),
+    [("verdicts/case-000", run), ("verdicts", run), ("verdicts/case-000", score), ("score", score)],
+)
+def test_a_file_in_the_place_of_a_folder_is_named(folder, place, task):
+    """Before a case is diagnosed; and no score leaves out the case whose verdict has become a file."""
+    (folder / place).parent.mkdir(exist_ok=True)
+    (folder / place).write_text("")
+    with refused(folder / place):
+        task(folder, workers=0)
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])

@@ -50,8 +50,9 @@ def test_what_is_made_behind_a_link_is_there(tmp_path):
 
 def test_a_file_in_the_way_is_an_error(tmp_path):
     (tmp_path / "folder").write_text("in the way")
-    with pytest.raises(NotADirectoryError), appearing(tmp_path / "folder"):
-        pass
+    for path in (tmp_path / "folder", tmp_path / "folder" / "own"):
+        with refused(tmp_path / "folder"), appearing(path):
+            pass
     assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
 
 
