@@ -12,15 +12,17 @@ import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import cloudpickle
 import numpy as np
+
+UNSENDABLE = (TypeError, pickle.PicklingError)  #: raised by what cannot be sent to a worker
 
 
 @cache
@@ -76,7 +78,7 @@ def _of_code(kind: type | FunctionType, met: list[Any]) -> list[str]:
         met.append(base)
         try:
             found += _of_script(base, met) if top == "__main__" else [_of_file(base), *_held(base, met)]
-        except (AttributeError, ImportError, OSError, pickle.PicklingError, SyntaxError, TypeError):
+        except (AttributeError, ImportError, OSError, SyntaxError, *UNSENDABLE):
             found.append(uuid.uuid4().hex)
     return found
 
@@ -96,19 +98,71 @@ def _of_script(kind: type | FunctionType, met: list[Any]) -> list[str]:
 
 
 def _held(kind: type | FunctionType, met: list[Any]) -> list[str]:
-    """Return the values that the functions of a class, or a function, hold from around them."""
-    own = [getattr(one, "__func__", getattr(one, "fget", getattr(one, "func", one))) for one in vars(kind).values()]
-    own = [inspect.unwrap(one) if callable(one) else one for one in own]
-    functions = [one for one in ([kind] if isinstance(kind, FunctionType) else own) if isinstance(one, FunctionType)]
+    """Return the values that a class, its functions, or a function hold from around them."""
+    found, held = list[str](), [("", kind)] if isinstance(kind, FunctionType) else sorted(vars(kind).items())
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+        held += [(one.name, one.default_factory) for one in dataclasses.fields(kind) if callable(one.default_factory)]
+    for name, value in held:
+        for one in _parts(value):
+            if isinstance(one, FunctionType):
+                found += _of_function(one, met)
+            elif not (name.startswith("__") or name == "_abc_impl"):  # those are made with the class
+                with suppress(*UNSENDABLE):
+                    found += [name, *_of_value(one, met)]
+    return found
+
+
+def _parts(value: Any) -> list[Any]:
+    """Return the functions of what stands for them in a class; of a function wrapped by no function the inner one."""
+    if isinstance(value, property):
+        return [one for one in (value.fget, value.fset) if one is not None]
+    if isinstance(value, staticmethod | classmethod):
+        return _parts(value.__func__)
+    if isinstance(value, cached_property):
+        return [value.func]
+    wrapped = callable(value) and not isinstance(value, FunctionType | type) and hasattr(value, "__wrapped__")
+    return [value.__wrapped__] if wrapped else [value]
+
+
+def _of_function(function: FunctionType, met: list[Any]) -> list[str]:
+    """Return the values that a function holds, and the code of one that wraps another; what it wraps is one of them."""
+    if function.__code__.co_filename in ("<string>", dataclasses.__file__):  # made from the fields of a class
+        return []
+    found = _of_code_object(function.__code__) if hasattr(function, "__wrapped__") else []
+    for own_part in (function.__defaults__, function.__kwdefaults__, vars(function)):
+        found += _of_value(own_part, met)
+    for name, value in sorted(_around(function).items()):
+        found += [name, *_of_value(value, met)]
+    return found
+
+
+def _around(function: FunctionType) -> dict[str, Any]:
+    """Return what a function, and functions within it, use of those around it, and of a script or notebook."""
+    there = function.__globals__ if function.__globals__.get("__name__") == "__main__" else {}
+    found = {name: there[name] for code in _codes(function.__code__) for name in code.co_names if name in there}
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        with suppress(ValueError):  # it is empty
+            found[name] = cell.cell_contents
+    return found
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    """Yield code and the code of all functions within it, comprehensions among them."""
+    yield code
+    for one in code.co_consts:
+        if isinstance(one, CodeType):
+            yield from _codes(one)
+
+
+def _of_code_object(code: CodeType) -> list[str]:
+    """Return what code does, wherever it stands."""
     found = []
-    for function in functions:
-        for own_part in (function.__defaults__, function.__kwdefaults__, vars(function)):
-            found += _of_value(own_part, met)
-        if function.__code__.co_filename not in ("<string>", dataclasses.__file__):  # made from its fields
-            used = inspect.getclosurevars(function)
-            there = used.globals if function.__module__ == "__main__" else {}
-            for name, value in sorted({**used.nonlocals, **there}.items()):
-                found += [name, *_of_value(value, met)]
+    for one in _codes(code):
+        names = (one.co_names, one.co_varnames, one.co_freevars, one.co_cellvars)
+        counts = (one.co_argcount, one.co_posonlyargcount, one.co_kwonlyargcount, one.co_flags)
+        plain = [c for c in one.co_consts if not isinstance(c, CodeType)]
+        constants = [repr(sorted(map(repr, c)) if isinstance(c, frozenset) else c) for c in plain]
+        found += [one.co_code.hex(), one.co_exceptiontable.hex(), repr((names, counts)), *constants]
     return found
 
 
@@ -145,6 +199,13 @@ def _reduced(value: Any) -> Iterable[Any]:
         found = copyreg.dispatch_table.get(type(value), lambda one: one.__reduce_ex__(4))(value)
     except TypeError:  # what cloudpickle alone can send
         found = cloudpickle.dumps(value)
+    if isinstance(found, str):  # it is sent by name, as a function with a cache is
+        return (
+            found,
+            type(value),
+            getattr(value, "__wrapped__", None),
+            sys.modules.get(str(getattr(value, "__module__", ""))),
+        )
     return found if isinstance(found, tuple) else (found,)
 
 

@@ -115,6 +115,77 @@ def test_of_a_script_what_a_class_uses_counts(tmp_path):
     assert digests(SCRIPT + "OTHER = 1\n") == [thing, one, two]
 
 
+HELD = """
+import functools
+import threading
+from dataclasses import dataclass, field
+from mcsim.support.code import class_digest, value_digest
+
+K = 1.0
+
+def scaled(factor):
+    def deco(function):
+        @functools.wraps(function)
+        def wrapped(*given):
+            return factor * function(*given)
+        return wrapped
+    return deco
+
+class Attribute:
+    level, lock = K, threading.Lock()
+
+class Method:
+    @scaled(K)
+    def simulate(self, seed):
+        return 1.0
+
+class Cached:
+    @functools.lru_cache
+    def simulate(self, seed):
+        return K
+
+@dataclass(frozen=True)
+class Fields:
+    amplitude: float = K
+
+@dataclass
+class Factory:
+    amplitudes: list = field(default_factory=lambda: [K])
+
+class Property:
+    level = property(lambda self: K)
+
+@functools.lru_cache
+def cached(seed):
+    return K
+
+def listed(seed):
+    return [K * x for x in range(3) if x in {1, 2, 3}]
+
+def within(seed):
+    return list(map(lambda x: K * x, range(3)))
+
+kinds = (Attribute, Method, Cached, Fields, Factory, Property)
+print(*map(class_digest, kinds), *map(value_digest, (Attribute(), scaled(2.0)(listed), cached, listed, within)))
+"""
+
+
+def test_everything_that_a_script_uses_counts(tmp_path):
+    """In attributes, decorators, functions with a cache, comprehensions and functions within functions."""
+
+    def digests(text):
+        (tmp_path / "script.py").write_text(text)
+        command = [sys.executable, str(tmp_path / "script.py")]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+
+    first = digests(HELD)
+    assert digests(HELD) == first
+    assert len(set(first)) == 11
+    assert not set(digests(HELD.replace("K = 1.0", "K = 1.5"))) & set(first)
+    changed = digests(HELD.replace("factor * function", "factor + function"))
+    assert [one == other for one, other in zip(first, changed, strict=True)] == [k not in (1, 7) for k in range(11)]
+
+
 def test_versions_count():
     assert package_digest(["mcsim.stats"], ["numpy"]) != package_digest(["mcsim.stats"])
     assert package_digest(["mcsim.stats"]) != package_digest(["mcsim.stats.gaussian"])
