@@ -3,6 +3,7 @@
 import ast
 import copyreg
 import dataclasses
+import dis
 import hashlib
 import inspect
 import pickle
@@ -50,8 +51,8 @@ def class_digest(kind: type | FunctionType) -> str:
 
     Of a module in no package, what it imports from its own folder counts as well; of a script or notebook the source,
     and what it uses of the rest. Files are read when code is first seen, as it is loaded then; values that functions
-    hold count as they are. Those of mcsim and of installed libraries do not count. Code whose source cannot be read,
-    typed at a prompt for instance, gets a new digest at every call.
+    hold count as they are. Those of mcsim and of installed libraries do not count. Code of a prompt or notebook without
+    source is known by what it is compiled to; what can be told in no way gets a new digest at every call.
     """
     return _hash(_of_code(kind, []))
 
@@ -89,20 +90,28 @@ def _of_file(kind: type | FunctionType) -> str:
 
 
 def _of_script(kind: type | FunctionType, met: list[Any]) -> list[str]:
-    """Return the source of what a script or notebook defines, and of what it uses that is defined there, too."""
-    source, imported = inspect.getsource(kind), set[str]()
-    with suppress(SyntaxError):  # of a function without a name within a statement
-        imported = _imported(ast.parse(textwrap.dedent(source)))
+    """Return the source of what a script or notebook defines, and of what it uses that is defined there, too.
+
+    What has no source, as code at a prompt, is known by what it is compiled to.
+    """
+    try:
+        source, imported = [inspect.getsource(kind)], set[str]()
+    except (OSError, TypeError):  # TypeError: of a class in a notebook
+        parts = [one for _, value in _values(kind) for one in _parts(value)]
+        codes = [one.__code__ for one in parts if isinstance(one, FunctionType)]
+        source = [text for code in codes for text in _of_code_object(code)]
+        imported = {name for code in codes for name in _imported_by(code)}
+    else:
+        with suppress(SyntaxError):  # of a function without a name within a statement
+            imported = _imported(ast.parse(textwrap.dedent(source[0])))
     modules = [import_module(name) for name in sorted(imported) if name in sys.modules or find_spec(name) is not None]
-    return [source, *(text for one in modules for text in _of_value(one, met)), *_held(kind, met)]
+    return [*source, *(text for one in modules for text in _of_value(one, met)), *_held(kind, met)]
 
 
 def _held(kind: type | FunctionType, met: list[Any]) -> list[str]:
     """Return the values that a class, its functions, or a function hold from around them."""
-    found, held = list[str](), [("", kind)] if isinstance(kind, FunctionType) else sorted(vars(kind).items())
-    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-        held += [(one.name, one.default_factory) for one in dataclasses.fields(kind) if callable(one.default_factory)]
-    for name, value in held:
+    found = list[str]()
+    for name, value in _values(kind):
         for one in _parts(value):
             if isinstance(one, FunctionType):
                 found += _of_function(one, met)
@@ -110,6 +119,15 @@ def _held(kind: type | FunctionType, met: list[Any]) -> list[str]:
                 with suppress(*UNSENDABLE):
                     found += [name, *_of_value(one, met)]
     return found
+
+
+def _values(kind: type | FunctionType) -> list[tuple[str, Any]]:
+    """Return what a class holds, by name; of a function itself."""
+    if isinstance(kind, FunctionType):
+        return [("", kind)]
+    own = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
+    made = [(one.name, one.default_factory) for one in own if callable(one.default_factory)]
+    return [*sorted(vars(kind).items()), *made]
 
 
 def _parts(value: Any) -> list[Any]:
@@ -126,7 +144,7 @@ def _parts(value: Any) -> list[Any]:
 
 def _of_function(function: FunctionType, met: list[Any]) -> list[str]:
     """Return the values that a function holds, and the code of one that wraps another; what it wraps is one of them."""
-    if function.__code__.co_filename in ("<string>", dataclasses.__file__):  # made from the fields of a class
+    if function.__code__.co_filename == dataclasses.__file__:  # the same for every class
         return []
     found = _of_code_object(function.__code__) if hasattr(function, "__wrapped__") else []
     for own_part in (function.__defaults__, function.__kwdefaults__, vars(function)):
@@ -152,6 +170,12 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
     for one in code.co_consts:
         if isinstance(one, CodeType):
             yield from _codes(one)
+
+
+def _imported_by(code: CodeType) -> set[str]:
+    """Return the packages and modules that code imports by their whole names."""
+    steps = (step for one in _codes(code) for step in dis.get_instructions(one))
+    return {str(step.argval).partition(".")[0] for step in steps if step.opname == "IMPORT_NAME" and step.argval}
 
 
 def _of_code_object(code: CodeType) -> list[str]:
