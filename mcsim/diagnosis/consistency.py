@@ -140,7 +140,8 @@ class Slices:
     lmax: int
     settings: DiagnosisSettings
     scatters: tuple[Matrix, ...] = ()  # of stochastic effects, (p + E, draws), that add to the covariance
-    _nulls: dict[bytes, SimulatedGaussian] = field(default_factory=dict, repr=False)  # of rows that were needed so far
+    #: of rows that were needed so far, by the bytes of their indices
+    nulls: dict[bytes, SimulatedGaussian] = field(default_factory=dict, repr=False)
 
     def findings(self, candidates: Sequence[Candidate], actions: Sequence[Action]) -> Findings:
         """Test a set of effects by what each does to the data.
@@ -156,7 +157,7 @@ class Slices:
         """
         scatters = tuple(action.scatter for action in actions if action.scatter is not None)
         if scatters and not self.scatters:
-            return replace(self, scatters=scatters, _nulls={}).findings(candidates, actions)
+            return replace(self, scatters=scatters, nulls={}).findings(candidates, actions)
         # More noise, or a pattern that is drawn, is more of chi^2: what is left in the maps then says nothing of it.
         noisy = any(one.effect.noise is not Effect.noise or one.parametrization.stochastic for one in candidates)
         free = np.concatenate([action.directions for action in actions], axis=1)
@@ -215,10 +216,10 @@ class Slices:
         if not 0 < len(rows) <= len(self.ensemble.simulations) // spare:
             return None
         key = rows.tobytes()
-        if key not in self._nulls:
+        if key not in self.nulls:
             own = self.ensemble.restrict(rows).gaussian
-            self._nulls[key] = own.with_extra_covariance(*(one[rows] for one in self.scatters))
-        return self._nulls[key]
+            self.nulls[key] = own.with_extra_covariance(*(one[rows] for one in self.scatters))
+        return self.nulls[key]
 
     def _compared(self, division: Division, action: Action, others: Matrix) -> Comparison | None:
         """Return the comparison of a division's parts; None if the effect does not show in two of them."""
@@ -280,18 +281,34 @@ class Slices:
         return found
 
     def _of_maps(self, channel: str | None, action: Action) -> Iterator[Comparison]:
-        """Yield the amplitude in each map's largest scales, against that of the fit with its relative error."""
-        response = action.response
+        """Yield the amplitude in each map's largest scales, against that of the fit with its relative error.
+
+        A map is a part of the data of the fit: by how much both amplitudes vary together follows from the simulations.
+        """
+        response, seen = action.response, list[tuple[str, Rows, SimulatedGaussian]]()
         for name, members in self._maps(channel).items():
             rows = np.array(members)
             null = self.null(rows)
-            if null is None or null.expected_snr(response[rows]) < self.settings.slice_snr:
-                continue
+            if null is not None and null.expected_snr(response[rows]) >= self.settings.slice_snr:
+                seen.append((name, rows, null))
+        whole = self._amplitudes(np.arange(len(self.z) - self.beside), action) if seen else None
+        for name, rows, null in seen:
             found = null.fit(self.z[rows], np.column_stack([response[rows], action.directions[rows]]))
             amplitude, own = float(found.amplitudes[0]), float(found.errors[0])
-            tolerated = np.sqrt(own**2 + action.error**2 + self.settings.consistency_error**2)
+            each = self._amplitudes(rows, action)
+            alike = 0.0 if whole is None or each is None else float(np.corrcoef(each, whole)[0, 1])
+            apart = own**2 + action.error**2 - 2.0 * alike * own * action.error
+            tolerated = np.sqrt(apart + self.settings.consistency_error**2)
             p = float(2.0 * special.stdtr(found.dof, -abs(amplitude - 1.0) / tolerated)) if own > 0.0 else 1.0
             yield Comparison("map", (name,), (amplitude,), (own,), p)
+
+    def _amplitudes(self, rows: Rows, action: Action) -> Vector | None:
+        """Return the amplitude that elements give to an effect in each simulation, shape (N,); None if in none."""
+        null = self.null(rows)
+        if null is None or not action.response[rows].any():
+            return None
+        t = null.whiten_templates(np.column_stack([action.response[rows], action.directions[rows]]))
+        return np.asarray(self.ensemble.simulations[:, rows] @ (np.linalg.pinv(t)[0] @ null.whitening))
 
     def _left(self, channel: str, responses: Matrix, directions: Matrix) -> MapCheck | None:
         """Return chi^2 of a channel's largest scales before and after effects are taken out; None if not known."""

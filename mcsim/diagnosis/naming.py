@@ -48,7 +48,8 @@ def slices_of(data: DataSet[Any]) -> Slices:
     """Return the parts of a data set, in which amplitudes are compared."""
     context, z = data.context, data.extended
     beside, lmax = len(z) - len(data.x), context.analysis.model.lmax
-    return Slices(context.ensemble.extended, z, beside, context.run.map.splits, lmax, context.settings)
+    known = {np.arange(len(data.x)).tobytes(): context.null}  # estimated once for all data sets
+    return Slices(context.ensemble.extended, z, beside, context.run.map.splits, lmax, context.settings, nulls=known)
 
 
 def unconfirmed(context: DiagnosisContext, found: Attribution, reduced: bool) -> str:

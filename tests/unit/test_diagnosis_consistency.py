@@ -1,6 +1,6 @@
 """A name must agree with all parts of the data, and its parameters be possible."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import healpy
@@ -20,6 +20,7 @@ from mcsim.sphere.rotation import rotation_matrix
 
 NSIDE = 16
 GAIN = Candidate(systematics.get("gain_drift"), "W1", (0, 1))
+CALIBRATION = Candidate(systematics.get("calibration"), "W1", (0,))
 
 
 def real_harmonic(degree, order, component, theta, phi):
@@ -126,6 +127,29 @@ def test_a_true_effect_is_refused_as_seldom_as_the_levels_say(bench):
     assert len(halves) == 300
     # The tolerated error of the response makes small p-values rarer.
     assert np.mean(np.array(halves) <= 0.05) <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 300)
+
+
+def test_a_map_is_compared_as_the_part_of_the_fit_that_it_is(bench):
+    """A calibration, fitted to two maps whose largest scales have 0.9 of the noise of the data vector's elements."""
+    draw, shape = np.random.default_rng(8), np.repeat(np.random.default_rng(9).normal(size=4)[None], 2, axis=0).ravel()
+    response = 6.0 * np.concatenate([shape, shape]) / np.linalg.norm(shape)
+
+    def noise(count):
+        of_vector = draw.normal(size=(count, 8))
+        own = np.sqrt(1.0 - 0.9**2) * draw.normal(size=(count, 8))
+        return np.concatenate([of_vector, 0.9 * of_vector + own], axis=1)
+
+    ensemble, settings = replace(bench.ensemble, simulations=noise(2000)), DiagnosisSettings(consistency_error=1e-6)
+    tested = Slices(ensemble, np.zeros(16), 8, ("half1", "half2"), 24, settings)
+    null, found = tested.null(np.arange(8)), []
+    for z in response + noise(400):
+        fit = null.fit(z[:8], response[:8, None])
+        action = Action.of(response * fit.amplitudes[0], response[:, None], fit.amplitudes, fit.covariance)
+        (each,) = replace(tested, z=z).findings([CALIBRATION], [action]).comparisons
+        found += [next(one.pvalue for one in each if one.kind == "map")]
+    for level in (0.05, 0.2, 0.5):
+        rate = float(np.mean(np.array(found) <= level))
+        assert abs(rate - level) < 4.0 * np.sqrt(level * (1.0 - level) / 400), level
 
 
 @pytest.mark.parametrize("known", [pytest.param(True, marks=pytest.mark.slow), False])
