@@ -299,9 +299,8 @@ class TemplateBank:
         noise, size = self._squares(spread)
         found = []
         for candidate, number in zip(candidates, skies, strict=True):
-            rows = list(candidate.columns)
             # A column of nothing but noise says nothing of the others.
-            clear = size[rows] > 2.0 * noise[rows]
-            ratio = number * noise[rows] / np.maximum(size[rows] - noise[rows], 1e-300)
-            found.append(float(np.sqrt(np.mean(ratio[clear]))) if clear.any() else np.inf)
+            rows = [column for column in candidate.columns if size[column] > 2.0 * noise[column]]
+            ratio = number * noise[rows] / (size[rows] - noise[rows])
+            found.append(float(np.sqrt(np.mean(ratio))) if rows else np.inf)
         return np.array(found)

@@ -1,9 +1,12 @@
 """Responses to a step of an effect, from skies with the opposite step and without."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from mcsim.datavector.campaign import responses
+from mcsim.datavector.candidate import TemplateBank
 
 STEP, SKIES = 0.3, 6
 
@@ -29,3 +32,13 @@ def test_an_effect_of_one_sign_has_the_response_at_its_step(skies):
     each, curvature = responses(-STEP, x(-STEP), None, x(0.0))
     np.testing.assert_allclose(each, slope - STEP * bent, rtol=0.0, atol=1e-12)
     assert not curvature.any()
+
+
+def test_a_column_of_nothing_but_noise_says_nothing_of_the_scatter_among_skies():
+    """However large it is in maps of little noise: of the others, 4 skies of 0.1 each are 0.2 about the mean."""
+    clear, noise = np.full(3, 1e6), np.array([1e6, 1e5, 1e5])
+    matrix, error = np.stack([clear, clear, noise], axis=1), np.stack([0.1 * clear, 0.1 * clear, 2.0 * noise], axis=1)
+    bank = TemplateBank(matrix, error, np.zeros((3, 3)), ())
+    candidates = [SimpleNamespace(columns=columns) for columns in ((0,), (1, 2), (2,))]
+    found = bank.sky_scatter(np.full(3, 1e-4), candidates, (4, 4, 4))
+    np.testing.assert_allclose(found, [0.2 / np.sqrt(0.99)] * 2 + [np.inf])
