@@ -12,10 +12,14 @@ import numpy as np
 from mcsim import config, systematics
 from mcsim.datavector.analysis import Analysis, Job
 from mcsim.datavector.campaign import Ask, after_jobs, constrained_jobs
-from mcsim.datavector.wiener_filter import shared_sky
-from mcsim.support.arrays import Alm, Map, Matrix, Vector
+from mcsim.datavector.wiener_filter import inverse_of, shared_sky
+from mcsim.support.arrays import Alm, Map, Matrix, Vector, divided
 
 SMALL = 2e-3  #: gain of a channel that observed skies may have in them: responses are wrong by less than this share
+
+BENT = 0.1  #: change of a beam at some degree, beside a gain, that observed skies may have in them
+
+Factors = tuple[tuple[float, ...], ...]  #: by which channels see degrees otherwise, (channel, lmax + 1); (): not
 
 Skies = Literal["reference", "typical", "constrained"]
 
@@ -37,41 +41,60 @@ class SameSkies:
         return self.observed_with(())
 
     def observed_with(self, found: Sequence[config.Effect]) -> Alm:
-        """Return the filtered sky of the maps if they have effects: without the gains that these are.
+        """Return the filtered sky of the maps if they have effects: as the channels see it then.
 
         Notes
         -----
         A gain 1 + g of one channel is in the filtered sky with a weight w: its response there is 1 + w g times the true
-        one, and a fit gives g/(1 + w g). Gains up to SMALL, the steps of linear responses among them, stay.
+        one, and a fit gives g/(1 + w g). So it is with each degree that a beam loses. Gains up to SMALL and beams up to
+        BENT, the steps of linear responses among them, stay.
         """
-        return self._skies_by_gain(self.gains(found))
+        return self._skies(self.factors(found))
 
     @cached_property
-    def _skies_by_gain(self) -> Callable[[tuple[float, ...]], Alm]:
+    def _skies(self) -> Callable[[Factors], Alm]:
         @cache
-        def sky(gains: tuple[float, ...]) -> Alm:
-            pairs = zip(self.maps, gains, strict=True) if gains else ((map_, 1.0) for map_ in self.maps)
+        def sky(factors: Factors) -> Alm:
+            model = self.analysis.model
+            if not factors:
+                return shared_sky(model, self.maps)
+            rows = np.array(factors)
+            gains = np.where(np.ptp(rows, axis=1) == 0.0, rows[:, 0], 1.0)
+            pairs = zip(self.maps, gains[[part.channel for part in model.parts]], strict=True)
             given = [map_ if g == 1.0 else np.where(map_ == healpy.UNSEEN, map_, map_ / g) for map_, g in pairs]
-            return shared_sky(self.analysis.model, given)
+            if np.any(bent := rows / gains[:, None] != 1.0):
+                response = np.where(bent, model.response * rows, model.response)
+                inverse = None if model.inverse is None else inverse_of(model.cl, response, model.parts)
+                model = replace(model, response=response, inverse=inverse)
+            return shared_sky(model, given)
 
         return sky
 
-    def gains(self, found: Sequence[config.Effect]) -> tuple[float, ...]:
-        """Return the gain of each map that effects rescale as a whole; () if all are close to 1."""
-        model, library, by_channel = self.analysis.model, dict(self.analysis.library), []
+    def factors(self, found: Sequence[config.Effect]) -> Factors:
+        """Return by how much effects change what each channel sees, by degree; () if all is close to 1.
+
+        It is one number for all degrees where the effects rescale the channel as a whole.
+        """
+        model, library, rows = self.analysis.model, dict(self.analysis.library), []
         for channel in model.survey.channels if found else ():
             own = [one for one in found if one.channel in (None, channel.name)]
             acting = [systematics.build(library[one.name], dict(one.parameters)) for one in own]
-            by_channel.append(systematics.rescaling(acting, channel.site))
-        if all(abs(gain - 1.0) <= SMALL for gain in by_channel):
-            return ()
-        return tuple(by_channel[part.channel] for part in model.parts)
+            row = np.full(model.lmax + 1, systematics.rescaling(acting, channel.site))
+            before, after = (
+                beam.blm[0, : model.lmax + 1].real
+                for beam in (channel.site.beam, systematics.seen_through(acting, channel.site, displacing=()))
+            )
+            shape = np.where(before > 0.0, divided(after, before), 1.0)
+            rows.append(shape if np.abs(shape / row - 1.0).max() > BENT else row)
+        return (
+            () if all(np.abs(row - 1.0).max() <= SMALL for row in rows) else tuple(tuple(row.tolist()) for row in rows)
+        )
 
     @cached_property
-    def _before(self) -> dict[tuple[bool, bool, tuple[float, ...]], list[Vector]]:
+    def _before(self) -> dict[tuple[bool, bool, Factors], list[Vector]]:
         """Return data vectors without any effect, as many as were needed so far.
 
-        Keys are True for constrained skies, and for an external simulator; and the gains that these skies are without.
+        Keys are True for constrained skies, for an external simulator, and the factors that these skies are without.
         """
         return defaultdict(list)
 
@@ -108,7 +131,7 @@ class SameSkies:
         """Return data vectors of the same skies without effects and with them, which the observed maps have too."""
         jobs = self._jobs(found, constrained, skies, there=found)
         after, source = self._simulated(jobs), jobs[0].source
-        before = self._before[constrained, source is not None, self.gains(found) if constrained else ()]
+        before = self._before[constrained, source is not None, self.factors(found) if constrained else ()]
         if (first := len(before)) < skies:
             same = [replace(job, source=source) for job in self._jobs((), constrained, skies, first, found)]
             before.extend(self._simulated(same)[first - skies :])

@@ -142,7 +142,7 @@ class Model:
             return self
         if not self.white:
             return self._of_mean()
-        inverse = _inverse(self.cl, self.response, self.parts, offsets=True)
+        inverse = inverse_of(self.cl, self.response, self.parts, offsets=True)
         return replace(self, inverse=inverse, settings=replace(self.settings, filter_tolerance=EXACT))
 
     @property
@@ -174,7 +174,7 @@ class Model:
         total = np.sum([part.precision for part in parts], axis=0)
         mean = replace(parts[0], channel=0, precision=total / (1.0 + alike * total))
         settings = replace(self.settings, filter_tolerance=EXACT)
-        inverse = _inverse(self.cl, response[None], [mean])
+        inverse = inverse_of(self.cl, response[None], [mean])
         return replace(self, parts=tuple(parts), inverse=inverse, settings=settings, pooled=alike)
 
     def of(self, channel: int) -> tuple[int, ...]:
@@ -234,7 +234,7 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     unresolved = beyond * np.sqrt(survey.cl) * response
     cl, response, snr = survey.cl[: lmax + 1], response[:, : lmax + 1], snr[: lmax + 1]
     dipole = dipole_alm(survey.channels[0].site.dipole_uk, lmax)
-    inverse = _inverse(cl, response, parts) if known and hidden >= settings.hidden_share else None
+    inverse = inverse_of(cl, response, parts) if known and hidden >= settings.hidden_share else None
     maps = survey.nside, cl, response, tuple(parts), dipole
     return Model(survey, lmax, *maps, inverse, known and white, unresolved, snr / (1.0 + snr), settings)
 
@@ -243,7 +243,9 @@ def _has_white_noise(m: SurveyMap) -> bool:
     return m.drawn is None and m.pairs is None and (m.preparation is None or not m.preparation.transforms)
 
 
-def _inverse(cl: Cl, response: NDArray[np.float64], parts: Sequence[Part], offsets: bool = False) -> InverseCovariance:
+def inverse_of(
+    cl: Cl, response: NDArray[np.float64], parts: Sequence[Part], offsets: bool = False
+) -> InverseCovariance:
     """Return the inverse covariance of all maps, of the circular parts of their beams.
 
     They are those at the centres of pixels, or, with ``offsets``, at the means of their samples.

@@ -88,8 +88,8 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return before[:, :size], after[:, :size]
 
     def rescaled(self, found: Sequence[config.Effect]) -> bool:
-        """Return True if the observed sky has to be found without the gain that effects are."""
-        return bool(self.same_skies.gains(found))
+        """Return True if the observed sky has to be found as effects let the channels see it."""
+        return bool(self.same_skies.factors(found))
 
     def templates(self) -> Matrix:
         """Return the templates; those that depend on the very sky are measured on the observed one if it departs."""
