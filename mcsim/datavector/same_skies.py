@@ -106,12 +106,19 @@ class SameSkies:
     def skies_of(self, effect: config.Effect) -> Skies:
         """Return in which skies the response to an effect is measured.
 
-        One with a mean response, or a drawn pattern, is of typical skies: the observed sky has its power already.
+        One with a mean response, or a drawn pattern, is of typical skies: the observed sky has its power already. So it
+        has what a window does to it, if no other channel shows the sky.
         """
         how = dict(self.analysis.library)[effect.name].parametrization
-        if how.mean_response == how.stochastic:
-            return "constrained"
-        return "reference" if how.mean_response else "typical"
+        if how.stochastic:
+            return "constrained" if how.mean_response else "typical"
+        return "reference" if how.mean_response or self._changes_power(effect) else "constrained"
+
+    def _changes_power(self, effect: config.Effect) -> bool:
+        """Return True for what a beam, or a pixel, does to the power of the sky of the only channel."""
+        kind, alone = dict(self.analysis.library)[effect.name], len(self.analysis.model.channels) == 1
+        shapes = kind.beam is not systematics.Effect.beam or kind.spread is not systematics.Effect.spread
+        return alone and shapes
 
     def ahead(self, each: Sequence[config.Effect], skies: int) -> None:
         """Simulate single effects at once that :meth:`of_reference` or :meth:`pair` will be asked for one by one.
