@@ -128,9 +128,9 @@ class PowerLaw(Parametrization):
 
     Notes
     -----
-    With x the ratios, A x^index is fitted as c_1 x^2 + c_2 x^-2: exact at two frequencies, by least squares at more.
-    Maps of one sky tell a signal in it only by their differences: an index takes two, of three frequencies, or of two
-    and a map without foregrounds.
+    With x the ratios, A x^index is fitted as c_1 x^2 + c_2 x^-2 at two frequencies, and with c_3 more at three, where
+    both are exact, and by least squares at more of them. Maps of one sky tell a signal in it mostly by their
+    differences: an index takes two, of three frequencies, or of two and a map without foregrounds.
     """
 
     parameter: str  #: name of the index, which is that of the effect where it is not fitted
@@ -149,7 +149,7 @@ class PowerLaw(Parametrization):
         return replace(self, ratios=ratios) if len(seen) > 2 else self
 
     def basis(self) -> tuple[Mapping[str, Any], ...]:
-        return tuple({self.parameter: float(index)} for index in _PIVOTS) if self.ratios else ({},)
+        return tuple({self.parameter: float(index)} for index in self._pivots) if self.ratios else ({},)
 
     def coordinates(self, effect: Any) -> Vector:
         if not self.ratios:
@@ -169,10 +169,15 @@ class PowerLaw(Parametrization):
         along, size = self._projected(np.array([index]), coordinates, precision)
         return {"amplitude": float(along[0] / size[0]), self.parameter: index}
 
+    @property
+    def _pivots(self) -> Vector:
+        """Return the indices of the basis: one for each frequency, up to three."""
+        return _PIVOTS[: len(self.ratios)]
+
     def _unit(self, indices: Vector) -> Vector:
-        """Return the coordinates at unit amplitude, shape (2, indices)."""
+        """Return the coordinates at unit amplitude, shape (k, indices)."""
         x = np.array(self.ratios)[:, None]
-        return np.asarray(np.linalg.pinv(x**_PIVOTS) @ x**indices)
+        return np.asarray(np.linalg.pinv(x**self._pivots) @ x**indices)
 
     def _projected(self, indices: Vector, at: Vector, precision: NDArray[np.float64]) -> tuple[Vector, Vector]:
         """Return the products of the unit coordinates with others, and with themselves, in the metric."""
@@ -180,7 +185,7 @@ class PowerLaw(Parametrization):
         return unit.T @ precision @ at, np.maximum(np.sum(unit * (precision @ unit), axis=0), 1e-300)
 
 
-_PIVOTS = np.array([2.0, -2.0])
+_PIVOTS = np.array([2.0, -2.0, 0.0])
 _STEEPEST = 12.0
 
 

@@ -214,30 +214,34 @@ def test_an_index_is_fitted_where_two_differences_of_channels_tell_it():
     for seen in ((94.0,), (94.0, None), (61.0, 94.0), (61.0, 94.0, 94.0)):
         assert plain.seen_at(seen) == plain
         assert (plain.basis(), plain.measured) == (({},), ())
-    for seen in ((61.0, 94.0, None), (41.0, 61.0, 94.0)):
+    for seen, columns in (((61.0, 94.0, None), 2), ((41.0, 61.0, 94.0), 3), ((23.0, 41.0, 61.0, 94.0), 3)):
         assert plain.seen_at(seen).measured == ("spectral_index",)
-        assert len(plain.seen_at(seen).basis()) == 2
+        assert len(plain.seen_at(seen).basis()) == columns
 
 
 @pytest.mark.parametrize("seen", [(61.0, 94.0, None), (30.0, 44.0, 70.0), (23.0, 33.0, 41.0, 61.0, 94.0)])
 def test_amplitude_and_index_are_those_of_their_coordinates(seen):
-    kind, metric = systematics.get("foreground_residual"), np.array([[2.0, 0.9], [0.9, 1.0]])
+    kind = systematics.get("foreground_residual")
     fit = kind.parametrization.seen_at(seen)
+    metric = np.array([[2.0, 0.9, 0.3], [0.9, 1.0, 0.1], [0.3, 0.1, 1.5]])[: len(fit.basis()), : len(fit.basis())]
     for amplitude, index in ((3.0, 2.0), (3.0, -2.0), (-5.0, 0.4), (2.0, -3.1), (40.0, 3.9)):
         effect = kind(amplitude=amplitude, spectral_index=index)
         found = fit.nearest(fit.coordinates(effect), metric)
         assert found == pytest.approx({"amplitude": amplitude, "spectral_index": index}, rel=1e-4, abs=1e-4)
         assert fit.coordinates(effect.scaled(2.0)) == pytest.approx(2.0 * fit.coordinates(effect))
     ends = [fit.coordinates(kind(amplitude=1.0, **parameters)) for parameters in fit.basis()]
-    np.testing.assert_allclose(ends, np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(ends, np.eye(len(ends)), atol=1e-11)
 
 
-def test_coordinates_at_two_frequencies_are_exact():
-    """c_1 x^2 + c_2 x^-2 is x^index at either."""
-    kind, x = systematics.get("foreground_residual"), np.array([61.0, 94.0]) / 94.0
+@pytest.mark.parametrize("seen", [(61.0, 94.0, None), (28.4, 44.1, 70.4)])
+def test_coordinates_at_two_and_three_frequencies_are_exact(seen):
+    """c_1 x^2 + c_2 x^-2 is x^index at either of two, and with c_3 more at each of three."""
+    kind, x = systematics.get("foreground_residual"), np.array([one for one in seen if one is not None]) / 94.0
+    fit = kind.parametrization.seen_at(seen)
+    powers = np.stack([x ** parameters["spectral_index"] for parameters in fit.basis()])
     for index in (-3.0, 0.4, 1.5):
-        c = kind.parametrization.seen_at((61.0, 94.0, None)).coordinates(kind(amplitude=1.0, spectral_index=index))
-        np.testing.assert_allclose(c[0] * x**2 + c[1] * x**-2.0, x**index, rtol=1e-12)
+        c = fit.coordinates(kind(amplitude=1.0, spectral_index=index))
+        np.testing.assert_allclose(c @ powers, x**index, rtol=1e-10)
 
 
 def test_signals_of_two_signs_have_the_steepest_index():
