@@ -93,6 +93,17 @@ class Candidate:
         return np.array([self.parametrization.coordinates(one)[place] for place, one in enumerate(self.basis)])
 
     @property
+    def typical(self) -> Matrix:
+        """Return coordinates of unit amplitudes, (K, j), over whose responses detectable amplitudes are averaged."""
+        return self.parametrization.typical(self.effect(**self.settings))
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """Return the parameters with an error at which these amplitudes are, such as the index of a foreground."""
+        usual = self.effect(**self.settings)
+        return {name: float(getattr(usual, name)) for name in self.parametrization.measured}
+
+    @property
     def random_response(self) -> bool:
         """Return True if its templates are measured from random draws, not from an effect that is taken away."""
         return self.parametrization.stochastic and self.parametrization.sign >= 0

@@ -179,12 +179,13 @@ def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[Candida
             amplitude, sigma, words = alone.amplitude, alone.sigma, alone.words
         except InputError:
             amplitude, sigma, words = float("nan"), float("nan"), "no such amplitude"
-        reach, size = detectable(null, t[:, columns], len(candidates)), None
+        typical, fixed = candidate.typical, candidate.fixed
+        at = "".join(f" at {name.replace('_', ' ')} {value:g}" for name, value in fixed.items())
+        reach, size = detectable(null, t[:, columns], len(candidates), typical), None
         rows = min(max(int(rank[k]), 1), null.dimension)
         needed = snr_needed(rows, len(candidates), null.dimension, null.dof + 1)
         if np.isfinite(reach):
-            precision = np.eye(len(columns))
-            size = abs(candidate.with_coordinates(reach * precision[0], precision).amplitude)
+            size = abs(candidate.with_coordinates(reach * typical[:, 0], np.eye(len(columns))).amplitude)
         # Candidates that differ in settings only are variants of one effect.
         others = [j for j, other in enumerate(candidates) if other.identity != candidate.identity]
         similar = max(others, key=lambda j: abs(found.correlation[k, j]), default=None)
@@ -204,10 +205,11 @@ def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[Candida
             delta_chi2=null.hartlap_factor * float(found.singles[k].delta_chi2),
             pvalue=min(1.0, float(pvalues[k]) * int((rank > 0).sum())),
             detectable=size,
-            detectable_words="–" if size is None else candidate.effect.format_amplitude(size),
+            detectable_words="–" if size is None else candidate.effect.format_amplitude(size) + at,
+            fixed=fixed,
             similar=similar,
             correlation=cosine,
             strength=strength,
             separable=separable,
-            separable_words=candidate.effect.format_amplitude(separable) if np.isfinite(separable) else "–",
+            separable_words=candidate.effect.format_amplitude(separable) + at if np.isfinite(separable) else "–",
         )

@@ -95,9 +95,10 @@ class CandidateResult:
     delta_chi2: float
     pvalue: float
     #: detectable, detectable_words: amplitude that is found with 90 % power at 5 % false alarms; None where the data
-    #: vector does not respond
+    #: vector does not respond. fixed: other fitted parameters, which have these values there
     detectable: float | None
     detectable_words: str
+    fixed: dict[str, float]
     #: similar, correlation: index of the other effect with the most similar response, None without one, and their
     #: canonical correlation
     similar: int | None
@@ -291,8 +292,8 @@ class DiagnosisResult:
             "heard": [_effect_json(effect) for effect in self.partial],
             "left": self.partial_left,
             "detectable": [
-                {key: getattr(one, key) for key in ("name", "channel", "unit", "settings")}
-                | {"amplitude_90": one.detectable}
+                {key: getattr(one, key) for key in ("name", "channel", "unit")}
+                | {"settings": {**one.settings, **one.fixed}, "amplitude_90": one.detectable}
                 for one in self.candidates
                 if one.detectable is not None
             ],

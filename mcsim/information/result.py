@@ -253,16 +253,18 @@ def limits_of(
         own = list(candidate.columns)
         values = np.linalg.eigvalsh(fisher[np.ix_(own, own)])
         rank = max(int(np.sum(values > RESOLVED * values[-1])), 1)
-        size = float(np.mean(np.maximum(values, 0.0)))
+        typical = candidate.typical
+        size = max(float(np.einsum("kj,kl,lj", typical, fisher[np.ix_(own, own)], typical)) / typical.shape[1], 0.0)
         sigma = 1.0 / np.sqrt(size) if size > 0.0 else np.inf
-        share = np.diag(fisher)[own] / max(len(own) * size, 1e-300)
+        weight = np.mean(typical**2, axis=1)
+        share = weight * np.diag(fisher)[own] / max(size, 1e-300)
         others = np.where([one.identity == candidate.identity for one in left], -1.0, correlation[index])
         similar = int(np.argmax(others)) if np.any(others > 0.0) else None
         rho = 0.0 if similar is None else float(correlation[index, similar])
         found.append(
             EffectLimit(
                 *candidate.identity,
-                dict(candidate.settings),
+                {**candidate.settings, **candidate.fixed},
                 candidate.effect.unit,
                 candidate.label,
                 candidate.title,

@@ -58,18 +58,21 @@ def snr_needed(
     return float(brentq(lambda s: power(s, columns, alpha / tests, dimension, simulations) - target, 0.0, high))
 
 
-def detectable(null: SimulatedGaussian, t: NDArray[np.float64], tests: int) -> float:
+def detectable(
+    null: SimulatedGaussian, t: NDArray[np.float64], tests: int, typical: NDArray[np.float64] | None = None
+) -> float:
     """Return the smallest amplitude at which a candidate with columns ``t``, shape (p_raw, K), in one unit is detected.
 
-    It is the norm of the amplitudes of its columns, for the root mean square response over their directions; infinite
-    if the data do not respond. The Fisher matrix is that of the sample covariance without its bias:
-    F = (n - p - 1)/n t_w't_w. Level and power are those of :func:`snr_needed`.
+    It is that of the root mean square response to ``typical``, coordinates of unit amplitudes, shape (K, j); left out:
+    all directions of the columns. It is infinite if the data do not respond. The Fisher matrix is that of the sample
+    covariance without its bias: F = (n - p - 1)/n t_w't_w. Level and power are those of :func:`snr_needed`.
     """
     white = null.whiten_templates(t)
     response = null.hartlap_factor * np.linalg.eigvalsh(white.T @ white)
     # The data may have fewer elements than the effect has components.
     columns = max(int(np.sum(response > 1e-12 * response[-1])), 1)
-    mean = float(np.sqrt(np.mean(np.maximum(response, 0.0))))
+    seen = white if typical is None else white @ typical
+    mean = float(np.sqrt(null.hartlap_factor * np.sum(seen**2) / seen.shape[1]))
     return snr_needed(columns, tests, null.dimension, null.dof + 1) / mean if mean else np.inf
 
 

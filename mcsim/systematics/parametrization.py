@@ -54,6 +54,13 @@ class Parametrization:
         """Return the coordinates of an effect, shape (k,)."""
         return np.array([effect.amplitude])
 
+    def typical(self, effect: Any) -> NDArray[np.float64]:
+        """Return coordinates at unit amplitude, shape (k, j), over which a detectable amplitude is averaged.
+
+        By default these are the basis: its j = k effects stand for all directions.
+        """
+        return np.eye(len(self.basis()))
+
     def constrained(self, coordinates: Vector, precision: NDArray[np.float64]) -> Vector:
         """Return the fitted coordinates that the data constrain, and zeros; by default all of them.
 
@@ -155,6 +162,10 @@ class PowerLaw(Parametrization):
         if not self.ratios:
             return super().coordinates(effect)
         return np.asarray(effect.amplitude * self._unit(np.array([getattr(effect, self.parameter)]))[:, 0])
+
+    def typical(self, effect: Any) -> NDArray[np.float64]:
+        """Return the coordinates at the index of the effect: an amplitude says nothing without one."""
+        return self.coordinates(replace(effect, amplitude=1.0))[:, None]
 
     def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
         """Return amplitude and index; where no power law has these coordinates, the index is as steep as can be."""

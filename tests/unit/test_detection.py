@@ -61,6 +61,9 @@ def test_detectable_takes_the_rms_response_over_directions():
     one = detectable(known, t * [1.0, 0.0], 1)
     assert one == pytest.approx(snr_needed(1, 1, 4, 10**6) / np.sqrt(2.0), rel=1e-4)
     assert detectable(known, 0.0 * t, 1) == np.inf
+    typical = np.array([[1.0], [0.0]])
+    assert detectable(known, t, 1, typical) == pytest.approx(snr_needed(2, 1, 4, 10**6) / 2.0, rel=1e-4)
+    assert detectable(known, t, 1, np.eye(2)) == pytest.approx(detectable(known, t, 1))
 
 
 def test_cosines_are_canonical_correlations():

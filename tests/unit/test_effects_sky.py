@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mcsim import systematics
+from mcsim.datavector.candidate import Candidate
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.sphere import alm as alm_
@@ -242,6 +243,17 @@ def test_coordinates_at_two_and_three_frequencies_are_exact(seen):
     for index in (-3.0, 0.4, 1.5):
         c = fit.coordinates(kind(amplitude=1.0, spectral_index=index))
         np.testing.assert_allclose(c @ powers, x**index, rtol=1e-10)
+
+
+def test_an_amplitude_is_detectable_at_the_index_of_the_effect():
+    """At 94 GHz it is a hundred times larger for dust than for synchrotron at 28 GHz: their mean says nothing."""
+    kind = systematics.get("foreground_residual")
+    fit = kind.parametrization.seen_at((28.4, 44.1, 70.4))
+    np.testing.assert_allclose(fit.typical(kind()), [[1.0], [0.0], [0.0]], atol=1e-11)
+    one = Candidate(kind, None, (0, 1, 2), fit=fit)
+    assert (one.fixed, one.typical.shape) == ({"spectral_index": 2.0}, (3, 1))
+    plain = Candidate(kind, None, (0,))
+    assert (plain.fixed, plain.typical.tolist()) == ({}, [[1.0]])
 
 
 def test_signals_of_two_signs_have_the_steepest_index():
