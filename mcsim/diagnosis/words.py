@@ -159,10 +159,10 @@ def held_out(result: DiagnosisResult) -> str:
     if found is None:
         why = "a half of the data hardly measures the effects, or the held-out one shows no excess χ² by itself"
         return f"Not measured: {why if result.sets else 'no effect was added to the simulator'}."
-    left = f"what remains there {residual(found.pvalue_after)}"
     if found.before.value <= 0.0 or found.achieved.sigma >= LARGEST_ERROR:
         before, after = (measured(one.value, one.sigma) for one in (found.before, found.after))
-        return f"Excess χ² of {found.data} too small to measure a reduction: {before} before, {after} after; {left}."
+        return f"Too uncertain to measure a reduction: excess χ² of {found.data} {before} before, {after} after."
+    left = f"what remains there {residual(found.pvalue_after)}"
     return (
         f"Adding the best fit to the simulator removes {percent(found.achieved)} of the excess χ² of {found.data}; "
         f"{percent(found.predicted)} was predicted; {left}."
@@ -194,7 +194,8 @@ def unlisted(result: DiagnosisResult) -> list[str]:
         return [*found, "Its reduction on held-out data is not measured: they do not respond to it by themselves."]
     if held.before.value <= 0.0 or held.achieved.sigma >= LARGEST_ERROR:
         before, after = (measured(one.value, one.sigma) for one in (held.before, held.after))
-        return [*found, f"Excess χ² of {held.data} too small to measure a reduction: {before} before, {after} after."]
+        said = f"excess χ² of {held.data} {before} before, {after} after"
+        return [*found, f"Too uncertain to measure a reduction: {said}."]
     left = f"what remains there {residual(held.pvalue_after)}"
     return [
         *found,

@@ -297,6 +297,8 @@ def test_a_reduction_that_is_not_measured_is_not_quoted(diagnoses):
     vague = replace(one, held_out=replace(one.held_out, achieved=Measured(0.5, 2.0)))
     assert "50" not in words.held_out(vague)
     assert "215 ± 30" in words.held_out(vague)
+    # An amplitude that one half hardly knows may leave anything of the other.
+    assert p_equals(vague.held_out.pvalue_after) not in words.held_out(vague)
     assert "Not measured" in words.held_out(replace(one, held_out=None))
 
 
