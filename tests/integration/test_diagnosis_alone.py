@@ -44,7 +44,7 @@ def test_what_a_beam_does_to_the_only_channel_is_measured_in_typical_skies() -> 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "amplitude"), [("beam_width", 0.139), ("beam_ellipticity", 0.361)])
 def test_a_strong_beam_of_the_only_channel_has_its_name(name: str, amplitude: float) -> None:
-    """A spectrum, or one with a calibration and half of the ellipse, described skies as the wider beam had left them."""
+    """A spectrum, or one with a calibration and half of the ellipse, described skies as the wider beam left them."""
     run = config.load(table("T"))
     maps = list(simulate.maps(data_of(run, name, "T", seed=4711, amplitude=amplitude), 30))
     (own,) = mcsim.diagnose(run, maps, settings=DiagnosisSettings(time_ordered_skies=0)).effects
