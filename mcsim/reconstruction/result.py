@@ -32,7 +32,7 @@ class Reconstructed:
     coordinates: int  #: number of numbers that describe it
     #: of what it adds to the maps that it acts in, uK, of a foreground by its power; None if no effect can be like it
     rms_uk: float | None
-    relative_error: float  #: of its amplitude, which for noise is that of a variance
+    relative_error: float  #: of its amplitude, which for noise and for added power is that of a variance
     cause: str  #: A known effect that makes such structures, with its reference; "" if none
     alternatives: tuple[str, ...]  #: structures that are less probable by a factor of 20 at most, in plain words
     rival: dict[str, Any] | None  #: WORDS of another description, less probable by a factor of 4 at most
@@ -51,7 +51,8 @@ class Reconstructed:
         text = self.says[:1].upper() + self.says[1:]
         size = ""
         if self.rms_uk is not None:
-            root = 0.5 if self.stage == "noise" or self.kind == "power" else 1.0  # its amplitude is that of a variance
+            variance = self.stage == "noise" or (self.stage, self.kind) == ("added", "power")
+            root = 0.5 if variance else 1.0  # of the error of a variance
             size = f": {measured(self.rms_uk, root * self.rms_uk * self.relative_error, ' µK')} rms"
         other = "" if self.rival is None else f"; or, as probable within a factor of 4, it {self.rival['says']}"
         return f"{text}{other}{size} ({p_equals(self.pvalue)})."

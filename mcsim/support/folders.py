@@ -153,6 +153,13 @@ def cached(name: str, fill: Callable[[Path], None], cache_dir: str | Path | None
     folder = root / name
     if not folder.is_dir():
         try:
+            not_a_file(folder)
+        except InputError as error:
+            raise InputError(
+                f"cache folder {str(root)!r} cannot be written ({str(error).partition(';')[0]}); move that away, or set "
+                "MCSIM_CACHE to another folder."
+            ) from None
+        try:
             with appearing(folder) as scratch:
                 fill(scratch)
         except OSError as error:

@@ -28,6 +28,7 @@ def held_out(before: float, after: float, predicted: float) -> HeldOut:
 @dataclass(frozen=True)
 class Result:
     notes: tuple[str, ...] = ("first",)
+    nuisances: tuple[object, ...] = ()
     unlisted: tuple[object, ...] | None = None
     unlisted_held_out: HeldOut | None = None
 
@@ -42,7 +43,7 @@ def test_what_held_out_data_refute_is_not_told(monkeypatch, before, after, predi
     for name in ("scene_for", "search_of"):
         monkeypatch.setattr(unlisted, name, lambda *_: None)
     monkeypatch.setattr(unlisted, "structures_of", lambda *_: (found, reduction))
-    analysis = SimpleNamespace(job=lambda _: None, run=None, settings=DiagnosisSettings())
+    analysis = SimpleNamespace(job=lambda _: None, run=None, nuisances=(), settings=DiagnosisSettings())
     data = SimpleNamespace(context=SimpleNamespace(analysis=analysis))
     result = unlisted.reconstructed(Result(), data, None)
     assert result.unlisted == (found if told else ())
@@ -109,5 +110,5 @@ def test_names_of_effects_that_a_run_or_a_library_has_are_not_given_again():
     run = SimpleNamespace(effects=(SimpleNamespace(name="/out/unlisted_1.py"), SimpleNamespace(name="gain_drift")))
     analysis = SimpleNamespace(run=run, library=(("unlisted_3", None), ("calibration", None)))
     data = SimpleNamespace(context=SimpleNamespace(analysis=analysis))
-    made = unlisted.Reconstruction(data, None, None, np.zeros(0))
+    made = unlisted.Reconstruction(data, data, None, None, np.zeros(0), None)
     assert made.names == ("unlisted_2", "unlisted_4", "unlisted_5")
