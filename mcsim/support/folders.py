@@ -155,9 +155,9 @@ def cached(name: str, fill: Callable[[Path], None], cache_dir: str | Path | None
         try:
             not_a_file(folder)
         except InputError as error:
+            why, _, _ = str(error).partition(";")
             raise InputError(
-                f"cache folder {str(root)!r} cannot be written ({str(error).partition(';')[0]}); move that away, or set "
-                "MCSIM_CACHE to another folder."
+                f"cache folder {str(root)!r} cannot be written ({why}); move it away, or set MCSIM_CACHE to another."
             ) from None
         try:
             with appearing(folder) as scratch:
