@@ -62,8 +62,8 @@ class SameSkies:
             gains = np.where(np.ptp(rows, axis=1) == 0.0, rows[:, 0], 1.0)
             pairs = zip(self.maps, gains[[part.channel for part in model.parts]], strict=True)
             given = [map_ if g == 1.0 else np.where(map_ == healpy.UNSEEN, map_, map_ / g) for map_, g in pairs]
-            if np.any(bent := rows / gains[:, None] != 1.0):
-                response = np.where(bent, model.response * rows, model.response)
+            if np.any((shapes := rows / gains[:, None]) != 1.0):
+                response = model.response * shapes
                 inverse = None if model.inverse is None else inverse_of(model.cl, response, model.parts)
                 model = replace(model, response=response, inverse=inverse)
             return shared_sky(model, given)

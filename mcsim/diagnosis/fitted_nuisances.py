@@ -28,7 +28,7 @@ from mcsim.simulation.nuisance import REACH, Nuisance, draws
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Map, Matrix, Vector
 
-SKIES = 4  #: skies, constrained by the data, on which nuisances are simulated
+SKIES = 4  #: skies, constrained by the data, on which nuisances and reconstructed effects are simulated
 ENOUGH = 0.95  #: information of the scores that measure a nuisance, over that of the structure that tells most of it
 
 

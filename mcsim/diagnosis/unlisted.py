@@ -14,7 +14,7 @@ from mcsim.datavector.analysis import simulated_maps
 from mcsim.datavector.campaign import Ask, constrained_jobs
 from mcsim.datavector.halves import Halves
 from mcsim.datavector.wiener_filter import sky_variance
-from mcsim.diagnosis.fitted_nuisances import FittedNuisances, Marginal
+from mcsim.diagnosis.fitted_nuisances import SKIES, FittedNuisances, Marginal
 from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
@@ -31,7 +31,6 @@ from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Map, Matrix, Vector
 
 ALTERNATIVES = 3  #: structures that are told beside the best at most
-SKIES = 4  #: skies, constrained by the data, on which a reconstructed effect is simulated
 LARGEST = 2.0  #: amplitude in a part of the data over that in all scores, at most; the least is none
 
 HIDDEN = (
