@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import healpy
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +21,7 @@ from mcsim.comparison.scene import Scene
 from mcsim.comparison.search import INTERPOLATING, Problem
 from mcsim.comparison.shown_sky import adds_orders, with_fewer_orders, with_shown_sky
 from mcsim.errors import InputError
+from mcsim.sphere import healpix
 from mcsim.support import folders
 from mcsim.support.progress import reporting
 
@@ -310,7 +310,7 @@ def _rms(values: NDArray[np.float64]) -> float:
 
 def _sky_rms(pair: ChannelPair, side: str = "A") -> float:
     """Return the rms of a side over the pixels that are seen, monopole and dipole fitted and taken off."""
-    axes = np.array(healpy.pix2vec(pair.nside, np.arange(pair.a.shape[1])))
+    axes = healpix.centres(pair.nside)
     left = []
     for one, seen in zip(pair.a if side == "A" else pair.b, pair.seen, strict=True):
         t = np.vstack([np.ones(int(seen.sum())), axes[:, seen]]).T

@@ -12,7 +12,7 @@ from mcsim.comparison.looks import neighbours
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import Maps, Scene
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import header
+from mcsim.sphere import header, healpix
 from mcsim.support.arrays import Vector
 
 SCREENED = 50_000  #: pixels on which orders of pixels are compared at most
@@ -122,10 +122,10 @@ class Dipole(Difference):
     proportional = True
 
     def starts(self, state: State) -> list[Vector]:
-        return [state.fit([np.broadcast_to(axis, state.maps.shape) for axis in _axes(state.pair.nside)])]
+        return [state.fit([np.broadcast_to(axis, state.maps.shape) for axis in healpix.centres(state.pair.nside)])]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
-        return maps + value @ _axes(state.pair.nside)
+        return maps + value @ healpix.centres(state.pair.nside)
 
     def amplitude(self, value: Vector) -> float:
         return float(np.linalg.norm(value))
@@ -133,10 +133,6 @@ class Dipole(Difference):
     def parameters(self, value: Vector) -> dict[str, float | str]:
         lon, lat = healpy.vec2ang(value, lonlat=True)
         return {"lon_deg": float(lon[0]), "lat_deg": float(lat[0])}
-
-
-def _axes(nside: int) -> Vector:
-    return np.array(healpy.pix2vec(nside, np.arange(12 * nside**2)))
 
 
 class Ordering(Difference):
@@ -165,7 +161,7 @@ def _alike(maps: Maps, state: State) -> float:
     """Return the correlation of side B with maps, dipoles aside, in some of the pixels."""
     some = np.arange(maps.shape[1]) % max(1, maps.shape[1] // SCREENED) == 0
     seen = state.pair.seen & (maps != healpy.UNSEEN) & some
-    axes = np.hstack([_axes(state.pair.nside)[:, one] for one in seen])
+    axes = np.hstack([healpix.centres(state.pair.nside)[:, one] for one in seen])
     known = np.vstack([np.ones(axes.shape[1]), axes]).T
     one, other = (v - known @ np.linalg.lstsq(known, v, rcond=None)[0] for v in (maps[seen], state.pair.b[seen]))
     return float(np.corrcoef(one, other)[0, 1])

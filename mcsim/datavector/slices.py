@@ -7,13 +7,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
-import healpy
 import numpy as np
 
-from mcsim.datavector.summaries import Element, of_map
+from mcsim.datavector.summaries import Element, of_map, sine_of_latitude
 from mcsim.datavector.wiener_filter import FilteredMaps, Model
 from mcsim.sphere import healpix, real
-from mcsim.sphere.rotation import rotation_matrix
 from mcsim.support.arrays import Matrix, Vector
 
 DEGREES = {"residual": 4, "gain": 2}
@@ -72,6 +70,6 @@ def northern(elements: Sequence[Element], frame: str) -> Matrix:
 def _overlap(frame: str, to: str, top: int) -> Matrix:
     """Return the integrals of products of real harmonics over a hemisphere."""
     npix, harmonics = 12 * NSIDE**2, _harmonics(NSIDE, top)
-    height = rotation_matrix(frame, to)[2] @ np.stack(healpy.pix2vec(NSIDE, np.arange(npix)))
+    height = sine_of_latitude(frame, to, NSIDE)
     weight = np.where(np.abs(height) < 1e-9, 0.5, height > 0.0) * 4.0 * np.pi / npix
     return np.asarray((harmonics * weight) @ harmonics.T)

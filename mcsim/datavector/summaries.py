@@ -176,9 +176,9 @@ def of_map(model: Model, part: int) -> Element:
     return Element(own.name, "map", (model.channels[own.channel],), own.split, fold, frame=model.frame)
 
 
-def _height(frame: str, to: str, nside: int) -> Map:
-    """Return the sine of the latitude in another frame of every pixel, RING, shape (npix,)."""
-    return np.asarray(rotation_matrix(frame, to)[2] @ np.stack(healpy.pix2vec(nside, np.arange(12 * nside**2))))
+def sine_of_latitude(frame: str, to: str, nside: int) -> Map:
+    """Return the sine of the latitude, in another frame, of every pixel in RING order, shape (npix,)."""
+    return np.asarray(rotation_matrix(frame, to)[2] @ healpix.centres(nside))
 
 
 def _beam_block(model: Model, part: int) -> Block:
@@ -224,7 +224,7 @@ def _lowest_block(model: Model, part: int) -> Block:
 
 def _plane_block(model: Model, part: int) -> Block:
     """Measure the residual along the Galactic plane, against its mean over the sky."""
-    profile = 1.0 / (1.0 + (_height(model.frame, "galactic", model.nside) / model.settings.plane_width) ** 2)
+    profile = 1.0 / (1.0 + (sine_of_latitude(model.frame, "galactic", model.nside) / model.settings.plane_width) ** 2)
     profile -= profile.mean()
     whole = replace(of_map(model, part), ell=(2, model.settings.large_scales), frame="galactic", kind="plane")
     element = replace(whole, name=f"plane/{whole.name}", L=2, M=0, parity="even")
@@ -234,7 +234,7 @@ def _plane_block(model: Model, part: int) -> Block:
 def _noise_block(model: Model, channel: int) -> Block:
     """Measure variance over expectation in bands of ecliptic latitude, alternate pixels apart."""
     parts, name = model.of(channel), model.channels[channel]
-    height = np.abs(_height(model.frame, "ecliptic", model.nside))
+    height = np.abs(sine_of_latitude(model.frame, "ecliptic", model.nside))
     seen = np.all([model.parts[i].precision > 0 for i in parts[:2]], axis=0)
     rows, elements = [], []
     for half, (low, high) in product((0, 1), pairwise(model.settings.latitude_edges)):
@@ -286,7 +286,8 @@ def _contrast_blocks(model: Model) -> list[Block]:
     groups = [[c for c, f in enumerate(frequencies) if f == end] for end in (known[0], known[-1])]
     top = min(model.settings.large_scales, model.lmax)
     nside = max(1, 1 << (top // 3).bit_length() - 1) * 2
-    height, ranges = np.abs(_height(model.frame, "galactic", nside)), list(pairwise(model.settings.latitude_edges))
+    ranges = list(pairwise(model.settings.latitude_edges))
+    height = np.abs(sine_of_latitude(model.frame, "galactic", nside))
     bands = np.stack([(height >= low) & (height <= high) for low, high in ranges]).astype(float)
     names = tuple(model.channels[c] for group in groups for c in group)
     alike = Element("contrast", "map", names, ell=(2, top), L=0, frame="galactic", kind="contrast")
@@ -346,7 +347,7 @@ def _isotropy_block(model: Model) -> Block:
     S^-1 s^ is cut to two ranges of degrees, one for each fold.
     """
     lmax, nside, ell = model.lmax, model.nside, np.arange(model.lmax + 1)
-    x, y, z = healpy.pix2vec(nside, np.arange(12 * nside**2))
+    x, y, z = healpix.centres(nside)
     forms = np.stack([x, y, z, 1.5 * z**2 - 0.5, x * z, y * z, x**2 - y**2, x * y])
     filters, elements = [], []
     for fold, (low, high) in enumerate(bins(2, lmax, 2)):

@@ -361,8 +361,8 @@ class NoisePattern(Form):
         if self.amplitude == 0.0:
             return None
         self.check_frame(site)
-        n = healpy.pix2vec(site.nside, np.arange(12 * site.nside**2))
-        return np.maximum(1.0 + self.amplitude * real.field(np.array(self.coefficients), *n), 0.0)
+        pattern = real.field(np.array(self.coefficients), *healpix.centres(site.nside))
+        return np.maximum(1.0 + self.amplitude * pattern, 0.0)
 
 
 def steps(edges: tuple[int, ...], values: tuple[complex, ...], lmax: int) -> NDArray[np.complex128]:

@@ -152,7 +152,7 @@ class Scene:
     @cached_property
     def dipole(self) -> Map:
         """Return the dipole in every pixel, uK."""
-        return self.dipole_uk @ np.stack(healpy.pix2vec(self.nside, np.arange(12 * self.nside**2)))
+        return self.dipole_uk @ healpix.centres(self.nside)
 
     @cached_property
     def keys(self) -> tuple[Key, ...]:
@@ -194,7 +194,7 @@ class Scene:
     @cached_property
     def _patterns(self) -> NDArray[np.float64]:
         """Return the real harmonics up to degree GAIN in every pixel, shape ((GAIN + 1)^2, npix)."""
-        n = healpy.pix2vec(self.nside, np.arange(12 * self.nside**2))
+        n = healpix.centres(self.nside)
         return np.stack([real.field(unit, *n) for unit in np.eye((GAIN + 1) ** 2)])
 
     @cached_property
@@ -316,8 +316,7 @@ class Scene:
     @cached_property
     def _dipole_elsewhere(self) -> list[list[Map]]:
         """Return the dipole in the directions of samples elsewhere, of every map and of all names, uK."""
-        nside = coarse(self.nside)
-        dipole = self.dipole_uk @ np.stack(healpy.pix2vec(nside, np.arange(12 * nside**2)))
+        dipole = self.dipole_uk @ healpix.centres(coarse(self.nside))
         return [[one @ dipole for one in view.elsewhere.values()] for view in self.views]
 
     def _elsewhere(self, r: Map, sky: Alm, i: int) -> list[Vector]:

@@ -11,13 +11,12 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Protocol
 
-import healpy
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.reconstruction.grammar import ALIKE, LOWEST, MEANS, Structure
 from mcsim.reconstruction.scores import INDICES
-from mcsim.sphere import real
+from mcsim.sphere import healpix, real
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector, divided
 
@@ -359,7 +358,7 @@ class Search:
         else:
             ((theta, _),) = self.fit([structure], scores)
             pattern = theta if structure.mix is None else structure.mix.T @ theta
-            a = real.field(np.asarray(pattern), *healpy.pix2vec(COARSE, np.arange(12 * COARSE**2)))
+            a = real.field(np.asarray(pattern), *healpix.centres(COARSE))
         a = np.maximum(a, LARGEST_FALL)
         if not np.any(np.abs(a) > TINY):
             return 1.0

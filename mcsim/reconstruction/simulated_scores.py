@@ -160,7 +160,8 @@ def _time_line(model: Model, channel: int) -> TimeLine:
     shape = int(np.ceil(pointing.model.duration_days * SECONDS_PER_DAY / span_s)), 12 * model.nside**2
     visits, weights = [], dict[str, list[Map]]({on: [] for on in PERIODIC})
     sky = sky_variance(model.cl * model.sky_power, model.response[channel])
-    dipole = np.asarray(site.dipole_uk) @ np.stack(healpy.pix2vec(model.nside, np.arange(shape[1])))
+    dipole = site.dipole_uk @ healpix.centres(model.nside)
+    squares: tuple[float | Map, ...] = 1.0, dipole**2 + sky
     for split, i in enumerate(members):
         grid = MapGrid(model.nside, model.frame, run.map.span(split))
         total = csr_matrix(shape)
@@ -168,7 +169,7 @@ def _time_line(model: Model, channel: int) -> TimeLine:
             spans = np.minimum((chunk.time_s / span_s).astype(int), shape[0] - 1)
             total += csr_matrix((np.ones(len(spans)), (spans, chunk.pixel)), shape)
         visits.append(total @ diags(divided(1.0, total.sum(axis=0).A1)))
-        for on, square in zip(PERIODIC, (1.0, dipole**2 + sky), strict=True):
+        for on, square in zip(PERIODIC, squares, strict=True):
             weights[on].append(model.parts[i].precision * square)
     return TimeLine.of(tuple(visits), span_s, weights)
 

@@ -256,7 +256,7 @@ def _up_to(lmax: int, window: NDArray[np.float64], name: str) -> NDArray[np.floa
 
 def _harmonics(nside: int, monopole: bool, dipole: bool) -> NDArray[np.float64]:
     """Return 1 and x, y, z at the pixels' centres, as wanted, shape (K, npix)."""
-    rows = np.stack([np.ones(12 * nside**2), *healpy.pix2vec(nside, np.arange(12 * nside**2))])
+    rows = np.stack([np.ones(12 * nside**2), *healpix.centres(nside)])
     return rows[np.array([monopole, dipole, dipole, dipole])]
 
 

@@ -37,6 +37,11 @@ def geometry(nside: int) -> dict[str, Any]:
     return dict(ducc0.healpix.Healpix_Base(nside, "RING").sht_info())
 
 
+def centres(nside: int) -> NDArray[np.float64]:
+    """Return the unit vectors of the centres of all pixels in RING order, shape (3, npix)."""
+    return np.stack(healpy.pix2vec(nside, np.arange(12 * nside**2)))
+
+
 def rings_between(nside: int, north: float, south: float) -> slice:
     """Return the rings between two colatitudes, radians, and the next one on either side."""
     theta = geometry(nside)["theta"]

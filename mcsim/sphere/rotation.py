@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from mcsim.errors import InputError
+from mcsim.sphere import healpix
 from mcsim.sphere.checks import check_alm, check_map
 
 FRAMES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
@@ -74,8 +75,7 @@ def rotate_alm(
 def rotate_pixels(values: NDArray, frame_from: str, frame_to: str) -> NDArray:
     """Return a HEALPix map (RING) in another frame, by the value at each pixel's centre: for masks and hits."""
     nside = check_map(values)
-    centres = np.array(hp.pix2vec(nside, np.arange(len(values))))
-    return values[hp.vec2pix(nside, *(rotation_matrix(frame_to, frame_from) @ centres))]
+    return values[hp.vec2pix(nside, *(rotation_matrix(frame_to, frame_from) @ healpix.centres(nside)))]
 
 
 def rotate_biposh(

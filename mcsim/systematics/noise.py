@@ -68,7 +68,7 @@ class NoiseAnisotropy(Effect):
     def noise(self, site: Site) -> Map | None:
         if self.amplitude == 0.0:
             return None
-        centres = np.stack(healpy.pix2vec(site.nside, np.arange(12 * site.nside**2)))
+        centres = healpix.centres(site.nside)
         if self.template:
             pattern = _of_file(self.template, site.frame, centres)
         else:

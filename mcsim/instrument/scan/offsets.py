@@ -2,10 +2,10 @@
 
 import math
 
-import healpy
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.sphere import healpix
 from mcsim.support.compiled import njit
 
 HIGHEST = 4  #: degree of the highest moments
@@ -37,10 +37,7 @@ def spin_moment(rows: NDArray[np.float64], spin: int) -> NDArray:
 
 def centres(nside: int) -> NDArray[np.float64]:
     """Return the unit vectors of the pixels' centres in RING order, shape (npix, 3)."""
-    found = np.empty((12 * nside * nside, 3))
-    for axis, values in enumerate(healpy.pix2vec(nside, np.arange(len(found)))):
-        found[:, axis] = values
-    return found
+    return np.ascontiguousarray(healpix.centres(nside).T)
 
 
 @njit(nogil=True, error_model="numpy")
