@@ -1,9 +1,9 @@
 """Differences of beam, scan, sky and pixels: what side B simulates otherwise than side A."""
 
 from dataclasses import replace
+from itertools import permutations
 from typing import ClassVar
 
-import ducc0
 import healpy
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from mcsim.comparison.description import EXTRA_ORDERS
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import WEAKEST, Maps, Scene
+from mcsim.comparison.sky_of_maps import mean_map
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.beams.coefficients import power_by_order
 from mcsim.instrument.scan import Moments
@@ -22,7 +23,7 @@ from mcsim.simulation import convolve
 from mcsim.simulation.channels import NEGLECTED
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
-from mcsim.sphere.rotation import euler_angles, rotation_matrix
+from mcsim.sphere.rotation import FRAMES, rotation_matrix, turn_alm
 from mcsim.support.arrays import Vector
 
 _SMALL = 1e-3  #: small angle in radians, share of a sample, or change of a variance, over which responses are linear
@@ -109,20 +110,18 @@ class FrameRotated(Difference):
         to_sky = rotation_matrix(shown, self.frame)
         a, b = (_turned(_mean_alm(side, state, lmax), lmax, to_sky, nthreads) for side in (state.maps, state.pair.b))
         found = []
-        for frame in ("ecliptic", "galactic", "equatorial"):
+        for frame in FRAMES:
             to_pole = rotation_matrix(self.frame, frame)
             one, other = (_turned(alm, lmax, to_pole, nthreads) for alm in (a, b))
             angle = _best_angle(one, other, lmax)
             pole = to_pole.T @ np.array([0.0, 0.0, 1.0])
             if abs(angle) > 1e-7:
                 found.append(np.rad2deg(angle) * pole)
-        for start in ("ecliptic", "galactic", "equatorial"):
-            for end in ("ecliptic", "galactic", "equatorial"):
-                if start != end:
-                    found.append(np.rad2deg(Rotation.from_matrix(rotation_matrix(start, end)).as_rotvec()))
+        for start, end in permutations(FRAMES, 2):
+            found.append(np.rad2deg(Rotation.from_matrix(rotation_matrix(start, end)).as_rotvec()))
         lost = [float(np.sum(np.abs(b - _turned(a, lmax, _matrix(value), nthreads)) ** 2)) for value in found]
-        best = sorted(range(len(found)), key=lambda i: lost[i])[:1]
-        return [found[i] for i in best if lost[i] < float(np.sum(np.abs(b - a) ** 2))]
+        best = int(np.argmin(lost))
+        return [found[best]] if lost[best] < float(np.sum(np.abs(b - a) ** 2)) else []
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         return replace(scene, sky=_turned(scene.sky, scene.lmax, _matrix(value), scene.nthreads))
@@ -140,17 +139,12 @@ def _matrix(rotation_deg: Vector) -> Vector:
 
 
 def _turned(alm: NDArray[np.complex128], lmax: int, matrix: Vector, nthreads: int) -> NDArray[np.complex128]:
-    if np.array_equal(matrix, np.eye(3)):
-        return alm
-    alpha, beta, gamma = euler_angles(matrix)
-    return np.asarray(ducc0.sht.rotate_alm(alm, lmax, gamma, beta, alpha, nthreads=nthreads))
+    return alm if np.array_equal(matrix, np.eye(3)) else turn_alm(alm, lmax, matrix, nthreads)
 
 
 def _mean_alm(maps: Maps, state: State, lmax: int) -> NDArray[np.complex128]:
-    seen = state.pair.seen
-    mean = np.where(seen, maps, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     nthreads = 1 if state.scene is None else state.scene.nthreads
-    return healpix.analysis(mean, lmax, iterations=1, nthreads=nthreads)
+    return healpix.analysis(mean_map(maps, state.pair.seen), lmax, iterations=1, nthreads=nthreads)
 
 
 def _best_angle(a: NDArray[np.complex128], b: NDArray[np.complex128], lmax: int) -> float:

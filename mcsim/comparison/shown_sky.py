@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.comparison.pairs import ChannelPair
-from mcsim.comparison.scene import WEAKEST, Maps, Scene
-from mcsim.comparison.sky_of_maps import NEAR, WHOLE, sky_in, wiener
+from mcsim.comparison.scene import Maps, Scene
+from mcsim.comparison.sky_of_maps import NEAR, WHOLE, circular_response, sky_in, wiener
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.support.arrays import Alm
@@ -199,8 +199,7 @@ def _weight(pair: ChannelPair) -> Maps | None:
 
 def _coefficients(scene: Scene, nside: int) -> int:
     """Return the number of real coefficients of the sky that maps of a scene show."""
-    factor = scene.response.factors[0].real[: 3 * nside]
-    return int((2 * np.flatnonzero(factor > WEAKEST * factor.max()) + 1).sum())
+    return int((2 * np.flatnonzero(circular_response(scene, nside)[1]) + 1).sum())
 
 
 def _filtered(pair: ChannelPair, weight: Maps) -> ChannelPair:
@@ -213,10 +212,8 @@ def _filtered(pair: ChannelPair, weight: Maps) -> ChannelPair:
     """
     scene = pair.scene
     assert scene is not None
-    lmax = min(scene.lmax, 3 * pair.nside - 1)
-    factor = scene.response.factors[0].real[: lmax + 1]
-    known = factor > WEAKEST * factor.max()
-    inverse = np.divide(1.0, factor, out=np.zeros_like(factor), where=known)
+    factor, known, inverse = circular_response(scene, pair.nside)
+    lmax = factor.size - 1
     total = weight.sum(axis=0)
     noise = healpy.nside2pixarea(pair.nside) / np.mean(total[total > 0.0])
     shown = healpy.alm2cl(alm_.multiply(alm_.resize(scene.sky, scene.lmax, lmax), factor, lmax))

@@ -10,7 +10,7 @@ from scipy.sparse.linalg import LinearOperator, cg, gmres
 from mcsim.comparison.scene import WEAKEST, Maps, Scene
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
-from mcsim.support.arrays import Alm, Vector
+from mcsim.support.arrays import Alm, Vector, divided
 
 ITERATIONS = 30
 """Largest number of iterations for the sky that whole maps show, and of each filter for what holes leave of it."""
@@ -24,6 +24,18 @@ FILTERS, FILTERS_AGAIN = 4, 2
 """How often maps with holes are filtered, each time less what the beam's shape made of the sky before."""
 
 NEAR = 5  #: degrees over which power is averaged
+
+
+def mean_map(maps: Maps, seen: NDArray[np.bool_]) -> Vector:
+    """Return the mean of maps, shape (split, npix), over those in which a pixel is seen; 0 where it is in none."""
+    return np.where(seen, maps, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+
+
+def circular_response(scene: Scene, nside: int) -> tuple[Vector, NDArray[np.bool_], Vector]:
+    """Return the circular part of a scene's response up to what pixels hold, where it is known, and 1 over it there."""
+    factor = scene.response.factors[0].real[: 3 * nside]
+    known = factor > WEAKEST * factor.max()
+    return factor, known, divided(known, factor)
 
 
 def sky_in(
@@ -50,13 +62,11 @@ def sky_in(
     nside = healpy.npix2nside(maps.shape[1])
     shown = min(empty.lmax, 3 * nside - 1)
     known = factor[: shown + 1] > WEAKEST * factor.max()
-    inverse = np.divide(1.0, factor[: shown + 1], out=np.zeros(shown + 1), where=known)
-    count = np.maximum(seen.sum(axis=0), 1)
+    inverse = divided(known, factor[: shown + 1])
     affine = replace(empty, sky=np.zeros_like(empty.sky)).maps() if empty.preparations else np.zeros_like(maps)
 
     def analysed(values: Maps) -> NDArray[np.float64]:
-        mean = np.where(seen, values, 0.0).sum(axis=0) / count  # with 0 for UNSEEN
-        found = healpix.analysis(mean, shown, nthreads=empty.nthreads)
+        found = healpix.analysis(mean_map(values, seen), shown, nthreads=empty.nthreads)
         return alm_.multiply(found, known.astype(float), shown).view(np.float64)
 
     def sky(smooth: NDArray[np.float64]) -> Alm:
@@ -80,16 +90,13 @@ def _behind_holes(maps: Maps, seen: NDArray[np.bool_], empty: Scene, beside: Alm
     the sky is seen: the sky of 39 % of the pixels is then too large by half, and moves wrongly with the samples.
     """
     nside, nthreads = empty.nside, empty.nthreads
-    lmax = min(empty.lmax, 3 * nside - 1)
-    factor = empty.response.factors[0].real[: lmax + 1]
-    known = factor > WEAKEST * factor.max()
-    inverse = np.divide(1.0, factor, out=np.zeros_like(factor), where=known)
+    factor, known, inverse = circular_response(empty, nside)
+    lmax = factor.size - 1
     before = np.zeros_like(empty.sky) if beside is None else beside
     smooth = alm_.multiply(alm_.resize(before, empty.lmax, lmax), factor * known, lmax)
     shown = smooth
     if beside is None:
-        mean = np.where(seen, maps, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
-        shown = healpix.analysis(mean, lmax, nthreads=nthreads)
+        shown = healpix.analysis(mean_map(maps, seen), lmax, nthreads=nthreads)
     power = healpy.alm2cl(shown) / float(seen.any(axis=0).mean())
     variance = TRUSTED**2 * float((2 * np.arange(lmax + 1) + 1) @ power) / (4.0 * np.pi)
     power = np.maximum(np.convolve(power, np.ones(NEAR) / NEAR, "same"), 1e-3 * variance * healpy.nside2pixarea(nside))
@@ -125,8 +132,7 @@ def wiener(
 
     first = np.zeros(2 * size.size)
     if start is not None:
-        inverse = np.divide(1.0, np.sqrt(power), out=np.zeros_like(power), where=power > 0.0)
-        first = (size * alm_.multiply(start, inverse, lmax)).view(np.float64)
+        first = (size * alm_.multiply(start, divided(1.0, np.sqrt(power)), lmax)).view(np.float64)
     diagonal = 1.0 + np.repeat(power[alm_.degrees(lmax)], 2) * weight.sum() / (4.0 * np.pi)
     shape = (diagonal.size, diagonal.size)
     found, _ = cg(

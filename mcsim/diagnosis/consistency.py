@@ -12,6 +12,7 @@ from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.slices import northern
 from mcsim.datavector.summaries import Element, bins, scales
+from mcsim.sphere.rotation import FRAMES
 from mcsim.stats.gaussian import SimulatedGaussian, Tolerated
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.numbers import number, p_equals
@@ -20,9 +21,6 @@ from mcsim.systematics import Effect
 Rows = NDArray[np.int64]
 
 LARGE = 12  #: highest degree of the largest scales
-
-FRAMES = ("ecliptic", "galactic", "equatorial")
-
 SPARE, SPARE_SHRUNK = 2.0, 1.25  #: simulations per element that a comparison needs; with a shrunk covariance
 
 

@@ -17,13 +17,12 @@ from mcsim.simulation.channels import check_effects
 from mcsim.simulation.survey import survey
 from mcsim.sphere.checks import check_whole
 from mcsim.sphere.header import first_table, opened
+from mcsim.sphere.rotation import FRAMES
 from mcsim.support.folders import appearing, unreadable, unwritable, user_path, writable
 from mcsim.support.progress import reporting
 
 POINTING: dict[bool, tuple[str, Any]] = {False: ("POINTING", "pixel means"), True: ("POINTING", "samples")}
 """Header card of maps by the default route, and sample by sample: what the pointing of samples is represented by."""
-
-_COORDINATES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
 
 
 def write_maps(
@@ -151,7 +150,7 @@ def _written(target: Path, names: Iterable[str], wanted: Sequence[tuple[str, Any
 def write_map(path: Path, map_uk: NDArray[np.float64], frame: str, header: list[tuple[str, Any]] | None = None) -> None:
     """Write one HEALPix map in RING order, uK, with its frame in the header."""
     healpy.write_map(
-        path, map_uk, dtype=np.float64, coord=_COORDINATES[frame], column_units="uK", column_names=["TEMPERATURE"],
+        path, map_uk, dtype=np.float64, coord=FRAMES[frame], column_units="uK", column_names=["TEMPERATURE"],
         fits_IDL=False, extra_header=header or (),
     )  # fmt: skip
 

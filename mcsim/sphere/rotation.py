@@ -68,7 +68,14 @@ def rotate_alm(
 ) -> NDArray[np.complex128]:
     """Return the a_lm of a real field, shape (size(lmax),), in another frame; InputError for another shape."""
     check_alm(alm, lmax)
-    alpha, beta, gamma = euler_angles(rotation_matrix(frame_from, frame_to))
+    return turn_alm(alm, lmax, rotation_matrix(frame_from, frame_to), nthreads)
+
+
+def turn_alm(
+    alm: NDArray[np.complex128], lmax: int, matrix: NDArray[np.float64], nthreads: int = 1
+) -> NDArray[np.complex128]:
+    """Return the a_lm of a real field whose directions are multiplied by a rotation matrix."""
+    alpha, beta, gamma = euler_angles(matrix)
     return np.asarray(ducc0.sht.rotate_alm(alm, lmax, gamma, beta, alpha, nthreads=nthreads))
 
 
