@@ -13,7 +13,7 @@ from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import Maps, Scene
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
-from mcsim.support.arrays import Vector
+from mcsim.support.arrays import Vector, divided
 
 SCREENED = 50_000  #: pixels on which orders of pixels are compared at most
 ALIKE = 0.5  #: correlation of neighbouring pixels from which on maps are no noise
@@ -336,7 +336,7 @@ class NoiseShared(Difference):
             hits = None if pair.hits is None else pair.hits[order]
         noise = other - pair.a - (sky - own if simulated else zero)
         if scaled and hits is not None and pair.hits is not None:
-            ratio = np.sqrt(np.divide(hits, pair.hits, out=np.ones_like(hits), where=pair.hits > 0))
+            ratio = np.sqrt(divided(hits, pair.hits, 1.0))
             noise = noise + (ratio - 1.0) * (other - sky)
         return np.where(seen, noise, 0.0)
 

@@ -26,6 +26,7 @@ from mcsim.simulation.filtering import unknown_dipole
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
 from mcsim.simulation.nuisance import nuisances_of
 from mcsim.support import folders
+from mcsim.support.arrays import divided
 from mcsim.support.numbers import duration
 from mcsim.support.progress import reporting
 from mcsim.support.settings import settings_of
@@ -195,10 +196,8 @@ def inverse_covariance(analysis: Analysis, settings: LimitSettings, nthreads: in
                     f"map {m.name} has no noise, so that nothing limits it; give channel {channel.name} a "
                     "noise.sigma0_uk above 0."
                 )
-            seen = (m.moments.hits > 0) & (m.noise_uk > 0.0)
-            if m.weight is not None:
-                seen = seen & (m.weight > 0.0)
-            precision = np.divide(1.0, m.noise_uk**2, out=np.zeros(seen.size), where=seen)
+            seen = m.moments.hits > 0 if m.weight is None else (m.moments.hits > 0) & (m.weight > 0.0)
+            precision = divided(seen, m.noise_uk**2)
             maps.append(ObservedMap(response, precision, m.moments if settings.orders else None))
     assert shared.cl is not None  # a model of the analysis has one
     cl = unknown_dipole(shared.cl, settings.unknown_dipole_uk)

@@ -165,7 +165,7 @@ class Bands:
         found = [
             (row, place, part)
             for row, place in zip(rows.tolist(), bins.tolist(), strict=True)
-            for part in ((0, 1) if self.modes[row].M else (int(self.modes[row].parity == "odd"),))
+            for part in self.modes[row].parts
         ]
         mode, place, part = np.array(found, dtype=np.int64).T
         return mode, place, part

@@ -11,6 +11,7 @@ from mcsim.bipolar import Estimator
 from mcsim.simulation import convolve
 from mcsim.simulation.filtering import TOLERANCE, Filtering, MapFilter, unknown_dipole
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
+from mcsim.support.arrays import divided
 
 
 def filtering_of(
@@ -33,8 +34,7 @@ def filtering_of(
         for m in channel.maps:
             assert m.noise_uk is not None  # as well as without noise
             weight = np.ones(m.noise_uk.size) if m.weight is None else m.weight / m.weight.max()
-            seen = (m.moments.hits > 0) & (m.noise_uk > 0.0)
-            precision = np.divide(weight**2, m.noise_uk**2, out=np.zeros(seen.size), where=seen)
+            precision = divided(np.where(m.moments.hits > 0, weight**2, 0.0), m.noise_uk**2)
             inverse = InverseCovariance(unknown_dipole(cl), [ObservedMap(response, precision)], TOLERANCE, nthreads)
             filters.append(MapFilter(m.name, inverse, channel.window, config.analysis_lmax(run)))
     pairs, tables = spectra_of
