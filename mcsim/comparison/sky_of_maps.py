@@ -118,7 +118,7 @@ def wiener(
     shape (lmax + 1,). ``start``: coefficients near the answer; None: zeros. ``iterations``: steps at most.
     """
     lmax, nside = power.size - 1, healpy.npix2nside(weight.size)
-    size = np.sqrt(np.where(alm_.orders(lmax) == 0, 1.0, 2.0))  # so that the product of vectors is that of maps
+    size = np.sqrt(alm_.multiplicity(lmax))  # so that the product of vectors is that of maps
 
     def of_map(values: NDArray[np.float64]) -> NDArray[np.float64]:
         alm = healpix.adjoint(values, lmax, nthreads)

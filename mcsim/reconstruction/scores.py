@@ -376,17 +376,16 @@ class Scene:
 
     def _powers(self, a: Alm, b: Alm) -> Vector:
         """Return the power in ranges of degrees."""
-        power = np.bincount(alm_.degrees(self.lmax), _twice(self.lmax) * (a * b.conj()).real, self.lmax + 1)
-        edges = self.fine
-        return np.array([power[low:high].sum() for low, high in pairwise(edges)])
+        products = alm_.multiplicity(self.lmax) * (a * b.conj()).real
+        power = np.bincount(alm_.degrees(self.lmax), products, self.lmax + 1)
+        return np.array([power[low:high].sum() for low, high in pairwise(self.fine)])
 
     def _of_sky(self, sky: Alm) -> Vector:
         """Return the scores of the sky's power, of patterns that multiply it, and of its motion.
 
         For what acts on the sky itself the residuals of all maps together are S^-1 s^, without monopole and dipole.
         """
-        weight = _twice(self.lmax) * np.abs(sky) ** 2
-        power = 0.5 * divided(1.0, self.cl) * np.bincount(alm_.degrees(self.lmax), weight, self.lmax + 1)
+        power = 0.5 * divided(1.0, self.cl) * alm_.power(sky, self.lmax)
         expected = alm_.multiply(sky, divided(1.0, self.cl), self.lmax)
         first, second = (healpix.synthesis(one[None], self.nside, self.lmax)[0] for one in (sky, expected))
         area = 4.0 * np.pi / first.size
@@ -435,9 +434,5 @@ def _low(product: Map, top: int) -> Vector:
     return real.coefficients(healpix.adjoint(product, top), top, top)
 
 
-def _twice(lmax: int) -> Vector:
-    return np.where(alm_.orders(lmax) == 0, 1.0, 2.0)
-
-
 def _product(a: Alm, b: Alm, lmax: int) -> float:
-    return float(np.sum(_twice(lmax) * (a.real * b.real + a.imag * b.imag)))
+    return float(np.sum(alm_.multiplicity(lmax) * (a.real * b.real + a.imag * b.imag)))

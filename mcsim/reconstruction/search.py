@@ -108,14 +108,11 @@ class Search:
     @cached_property
     def largest(self) -> Vector:
         """Return the largest evidence over the grammar of every simulation against all others, shape (N,)."""
-        count, falls = len(self.simulations), np.full((len(self.grammar), len(self.simulations)), np.nan)
+        falls = np.full((len(self.grammar), len(self.simulations)), np.nan)
         for row, (structure, null) in enumerate(zip(self.grammar, self.nulls, strict=True)):
-            if null is None:
-                continue
-            white = (structure.of(self.simulations) - null.mean) @ null.whitening.T
-            a = np.sum(white**2, axis=1) / null.dof * count / (count - 1)
-            square = (null.dof - 1) * a / np.maximum(1.0 - a, 1e-12)
-            falls[row] = square * (null.dof - null.dimension - 2) / (null.dof - 1)
+            if null is not None:
+                square, n = null.held_out(structure.of(self.simulations))
+                falls[row] = square * (n - null.dimension - 1) / n
         found = self._evidences(falls, range(len(self.grammar))).max(axis=0)
         return np.asarray(np.maximum(found, self.peaks.max(axis=1, initial=-np.inf)) if self.peaks.size else found)
 

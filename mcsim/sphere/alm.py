@@ -44,6 +44,11 @@ def orders(lmax: int) -> NDArray[np.int64]:
     return m
 
 
+def multiplicity(lmax: int) -> NDArray[np.float64]:
+    """Return how often every coefficient counts in a sum over all m: 1 at m = 0, else 2, shape (size(lmax),)."""
+    return np.where(orders(lmax) == 0, 1.0, 2.0)
+
+
 def multiply(alm: NDArray[np.complex128], factor: NDArray, lmax: int) -> NDArray[np.complex128]:
     """Return f_l a_lm for a factor f_l of shape (>= lmax + 1,), real or complex; InputError for other sizes."""
     _check_size(alm, lmax)
@@ -55,8 +60,7 @@ def multiply(alm: NDArray[np.complex128], factor: NDArray, lmax: int) -> NDArray
 def power(alm: NDArray[np.complex128], lmax: int) -> NDArray[np.float64]:
     """Return the sum of |a_lm|^2 over all m of every degree, shape (lmax + 1,); InputError for other sizes."""
     _check_size(alm, lmax)
-    weight = np.where(orders(lmax) == 0, 1.0, 2.0)
-    return np.asarray(np.bincount(degrees(lmax), weight * np.abs(alm) ** 2, lmax + 1), dtype=np.float64)
+    return np.asarray(np.bincount(degrees(lmax), multiplicity(lmax) * np.abs(alm) ** 2, lmax + 1), dtype=np.float64)
 
 
 def resize(alm: NDArray[np.complex128], lmax: int, new_lmax: int) -> NDArray[np.complex128]:

@@ -225,7 +225,6 @@ def _smoothed(lobe: SidelobePickup, dipole_uk: tuple[float, ...], frame: str) ->
         galaxy = template_alm(lobe.template, lmax, frame)
     else:
         galaxy = rotate_alm(lobe.galaxy_uk * _plane_alm(lmax), lmax, "galactic", frame)
-    ell = np.arange(lmax + 1.0)
-    window = np.exp(-0.5 * ell * (ell + 1.0) * sigma**2)
+    window = healpy.gauss_beam(np.deg2rad(lobe.width_deg), lmax)
     sky = alm_.multiply(galaxy + dipole_alm(dipole_uk, lmax), window, lmax)
     return np.asarray(healpix.synthesis(sky[None], _NSIDE, lmax)[0], dtype=np.float32)
