@@ -35,8 +35,7 @@ class Halves:
     @classmethod
     def of(cls, ensemble: NullEnsemble, x: Vector) -> "Halves | None":
         """Split by the folds of the elements; None if one has no element."""
-        folds = np.array([-1 if element.fold is None else element.fold for element in ensemble.elements])
-        first, second = np.flatnonzero(folds == 0), np.flatnonzero(folds == 1)
+        first, second = ensemble.folds
         if not len(first) or not len(second):
             return None
         return cls(x, ensemble.restrict(first).gaussian, ensemble.restrict(second).gaussian, first, second)

@@ -46,6 +46,12 @@ class NullEnsemble:
     shrunk: bool = False  # few simulations, whose covariance is shrunk; not with nuisances
     skies: int = 1  # of which the data are the mean
 
+    @property
+    def folds(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the places of the elements of fold 0, and of fold 1."""
+        folds = np.array([element.fold for element in self.elements])
+        return np.flatnonzero(folds == 0), np.flatnonzero(folds == 1)
+
     @cached_property
     def spread(self) -> Vector:
         """Return the standard deviation of every element, shape (p,)."""

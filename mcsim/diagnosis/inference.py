@@ -87,7 +87,8 @@ def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> At
 
     def errors(one: Explanation, best: bool) -> Explanation:
         members = [context.candidates[member] for member in one.members]
-        t, scatters = refined.templates[:, columns_of(context.candidates, one.members)], _scatters(refined, one)
+        t = refined.templates[:, columns_of(context.candidates, one.members)]
+        scatters = scatters_of(refined.candidates, one.members)
         null = context.null.with_extra_covariance(*scatters)
         scattered = partial(_scattered, data, one.members, t, scatters) if best else _as_it_is
         return replace(one, fit=with_priors(null, t, one.fit, members, scattered))
@@ -97,10 +98,6 @@ def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> At
 
 def _as_it_is(fit: Fit) -> Fit:
     return fit
-
-
-def _scatters(refined: Refined, one: Explanation) -> list[Matrix]:
-    return scatters_of(refined.candidates, one.members)
 
 
 def _scattered(data: DataSet[Any], members: Sequence[int], t: Matrix, scatters: Sequence[Matrix], first: Fit) -> Fit:

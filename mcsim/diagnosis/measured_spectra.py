@@ -70,9 +70,8 @@ class MeasuredSpectra(DataSet[Spectra]):
     def halves(self) -> tuple[Matrix, str]:
         """Return the matrix that subtracts from elements of fold 1 what those of fold 0 predict, and words."""
         ensemble = self.context.ensemble
-        folds = np.array([element.fold for element in ensemble.elements])
-        used, fresh = np.flatnonzero(folds == 0), np.flatnonzero(folds == 1)
-        count, size = len(ensemble.simulations), len(folds)
+        used, fresh = ensemble.folds
+        count, size = len(ensemble.simulations), len(ensemble.elements)
         turn = np.eye(size)
         if not len(used) or not len(fresh):
             return turn, ""

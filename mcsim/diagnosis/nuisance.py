@@ -166,8 +166,7 @@ def half_given_other(ensemble: NullEnsemble) -> Matrix:
     Both folds share the nuisances, and nothing else that is random. It is the identity without nuisances.
     """
     turn = np.eye(len(ensemble.elements))
-    folds = np.array([element.fold for element in ensemble.elements])
-    used, fresh = np.flatnonzero(folds == 0), np.flatnonzero(folds == 1)
+    used, fresh = ensemble.folds
     if ensemble.nuisances is None or not len(used) or not len(fresh):
         return turn
     half = ensemble.restrict(used)
