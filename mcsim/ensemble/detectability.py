@@ -80,19 +80,18 @@ def _spectra(survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[in
 
 def variables(survey: Survey, found: dict[tuple[int, int], Means], joint: float) -> dict[str, tuple[Any, ...]]:
     """Return the signal-to-noise variables of a summary for one sky, L > 0; ``joint`` is that of all maps."""
-    modes, lmax = survey.estimator.modes, survey.lmax
+    modes, layout = survey.estimator.modes, plan.layout(survey)
     rows = [row for row, (L, _, _) in enumerate(modes) if L > 0]
     anisotropic = [modes[row] for row in rows]
-    first = np.arange(0, lmax + 1, survey.config.biposh.summary_bin)
-    last = np.append(first[1:] - 1, lmax)
+    bins = list(zip(layout.first_ells().tolist(), layout.last_ells().tolist(), strict=True))
     each = np.full((len(survey.pairs), len(modes)), np.nan)
-    binned = np.full((*each.shape, len(first)), np.nan)
+    binned = np.full((*each.shape, len(bins)), np.nan)
     for number, (x, y) in enumerate(survey.pairs):
         signal = (found[x, y].beam - found[x, y].circular)[rows]
         spectra = _spectra(survey, found, (x, y), _overlap(survey, (x, y), 0).shared)
         f_sky = sky_fraction(survey, (x, y))
         each[number, rows] = signal_to_noise(signal, anisotropic, spectra, f_sky)
-        for b, ells in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
+        for b, ells in enumerate(bins):
             binned[number, rows, b] = signal_to_noise(signal, anisotropic, spectra, f_sky, ells)
     text = "signal to noise in one sky of what the beam adds to its circular part"
     jointly = "all maps and modes jointly (exact Fisher information)"

@@ -79,10 +79,13 @@ class Layout:
         """Return the first ell of every bin."""
         return np.arange(0, self.lmax + 1, self.bin_width)
 
+    def last_ells(self) -> NDArray[np.int64]:
+        """Return the last ell of every bin."""
+        return np.append(self.first_ells()[1:] - 1, self.lmax)
+
     def middles(self) -> NDArray[np.float64]:
         """Return the middle of every bin in ell."""
-        first = self.first_ells()
-        return np.asarray((first + np.append(first[1:] - 1, self.lmax)) / 2.0)
+        return np.asarray((self.first_ells() + self.last_ells()) / 2.0)
 
     def kept_attributes(self) -> dict[str, str | int | float]:
         """Return the attributes of kept maps besides unit and long name."""

@@ -121,14 +121,12 @@ def dataset(layout: Layout, sums: Sums, attributes: Mapping[str, Any]) -> "xr.Da
     own = {"units": "1", "long_name": "factor from raw coefficients to binned ones"}
     variables["bin_factor"] = (("mode", "ell"), _factors(layout.modes, layout.lmax).copy(), own)
     variables["count"] = ((), np.array(sums.count), {"units": "1", "long_name": "number of realizations"})
-    first, middles = layout.first_ells(), layout.middles()
-    final = np.append(first[1:] - 1, layout.lmax)
     coordinates = {k: v for k, v in layout.coordinates().items() if k not in ("realization", "map_name")}
     for name, dim, values, text in (
-        ("bin", "bin", middles, "middle of the bin in ell"),
-        ("bin_2", "bin_2", middles, "the other bin of a covariance"),
-        ("bin_first", "bin", first, "first ell of the bin"),
-        ("bin_last", "bin", final, "last ell of the bin"),
+        ("bin", "bin", layout.middles(), "middle of the bin in ell"),
+        ("bin_2", "bin_2", layout.middles(), "the other bin of a covariance"),
+        ("bin_first", "bin", layout.first_ells(), "first ell of the bin"),
+        ("bin_last", "bin", layout.last_ells(), "last ell of the bin"),
     ):
         coordinates[name] = (dim, values, {"units": "1", "long_name": text})
     origin = {name: attributes[name] for name in ("digest", "conventions", "packages")}
