@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
+from mcsim.simulation.channels import table_of
 from mcsim.stats.gaussian import Fit
 from mcsim.stats.scattered import Acting
 from mcsim.support.arrays import Matrix, Vector
@@ -141,8 +142,7 @@ class Candidate:
 
     def table(self, effect: Effect) -> config.Effect:
         """Return the effect as an ``[[effect]]`` of a run."""
-        parameters = {"amplitude": effect.amplitude, **effect.parameters()}
-        return config.Effect(name=effect.name, channel=self.channel, parameters=parameters)
+        return table_of(effect, self.channel)
 
     def beyond(self, amplitudes: Vector, covariance: Matrix) -> float:
         """Return how far fitted amplitudes are beyond what the effect can have, in standard deviations.

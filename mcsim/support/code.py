@@ -261,8 +261,7 @@ def _is_of_user(name: str) -> bool:
 
 
 def _digest(files: Iterable[Path], *more: str) -> str:
-    found = [*(hashlib.sha256(path.read_bytes()).hexdigest() for path in files), *more]
-    return hashlib.sha256("\n".join(found).encode()).hexdigest()
+    return _hash([*(hashlib.sha256(path.read_bytes()).hexdigest() for path in files), *more])
 
 
 def _with_imports(files: list[Path]) -> list[Path]:
