@@ -3,6 +3,7 @@
 import math
 from functools import lru_cache
 
+import healpy
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -66,12 +67,7 @@ def power(alm: NDArray[np.complex128], lmax: int) -> NDArray[np.float64]:
 def resize(alm: NDArray[np.complex128], lmax: int, new_lmax: int) -> NDArray[np.complex128]:
     """Return the coefficients cut or zero-padded to ``new_lmax``; raise InputError if they are not of ``lmax``."""
     _check_size(alm, lmax)
-    resized = np.zeros(size(new_lmax), dtype=np.complex128)
-    top = min(lmax, new_lmax)
-    for m in range(top + 1):
-        source, target = start(lmax, m), start(new_lmax, m)
-        resized[target + m : target + top + 1] = alm[source + m : source + top + 1]
-    return resized
+    return np.asarray(healpy.resize_alm(alm, lmax, lmax, new_lmax, new_lmax), dtype=np.complex128)
 
 
 def whole(given: ArrayLike, name: str) -> tuple[NDArray[np.complex128], int]:

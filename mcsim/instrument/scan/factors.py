@@ -62,19 +62,12 @@ def ring_means(moments: Moments) -> tuple[Vector, Vector, NDArray[np.complex128]
     From north to south: theta in radians and hits, shape (4 nside - 1,); w, shape (smax, 4 nside - 1), 0 in rings that
     were not observed.
     """
-    first, size = _rings(moments.nside)
+    first, size, *_ = healpy.ringinfo(moments.nside, np.arange(1, 4 * moments.nside))
     theta = healpy.pix2ang(moments.nside, first)[0]
     seen = np.asarray(moments.hits > 0.0, dtype=np.float64)
     observed = np.maximum(np.add.reduceat(seen, first), 1.0)
     w = np.array([np.add.reduceat(w * seen, first) / observed for w in moments.w])
     return theta, np.add.reduceat(moments.hits, first) / size / moments.hits.mean(), w
-
-
-def _rings(nside: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first pixel and the number of pixels of every HEALPix ring."""
-    ring = np.arange(1, 4 * nside)
-    size = 4 * np.minimum(np.minimum(ring, nside), 4 * nside - ring)
-    return np.cumsum(size) - size, size
 
 
 def scan_factors(moments: Moments, ell: Sequence[int] = ELLS) -> ScanFactors:
@@ -95,7 +88,7 @@ def scan_factors(moments: Moments, ell: Sequence[int] = ELLS) -> ScanFactors:
     seen = _seen(moments)
     colatitude = healpy.pix2ang(moments.nside, np.arange(moments.npix))[0][seen]
     rings, _, w = ring_means(moments)
-    first, size = _rings(moments.nside)
+    first, size, *_ = healpy.ringinfo(moments.nside, np.arange(1, 4 * moments.nside))
     share = np.add.reduceat(seen.astype(np.float64), first) / size
     w2 = moments.w[1].real[seen]
     found = _factors(colatitude, np.ones(w2.size), w2, ell, lambda theta: np.interp(theta, rings, share * w[1].real))
