@@ -14,7 +14,6 @@ from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import Maps, Scene
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.instrument.scan import ScanModel
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.channels import table_of
 from mcsim.simulation.survey import Survey, survey
@@ -53,7 +52,7 @@ class EffectDifference(Difference):
         self.kind, self.templates, self.run, self.sky = kind, templates, run, sky
         self.name, self.unit, self.met = kind.name, kind.unit, kind.cause
         self.linear = kind.name != GAIN
-        self._there: dict[tuple[bytes | float, ...], Maps] = {}
+        self._there: dict[tuple[bytes, float, tuple[float, float] | None], Maps] = {}
         self._products = np.tensordot(templates, templates, ((1, 2), (1, 2))) / templates[0].size
         power = healpy.alm2cl(sky)
         self._largest = float((2 * np.arange(power.size) + 1) @ power) / (4.0 * np.pi)
@@ -82,7 +81,8 @@ class EffectDifference(Difference):
             return self.templates
         # A few per cent of a shift do not matter.
         scene = replace(scene, late=float(f"{scene.late:.2g}"), sky=self.sky)
-        key = (scene.beam.blm.tobytes(), scene.late, *_periods(scene.motion))
+        periods = None if scene.motion is None else (scene.motion.spin_period_s, scene.motion.precession_period_s)
+        key = scene.beam.blm.tobytes(), scene.late, periods
         if key not in self._there:
             basis = basis_of(self.kind)
             try:
@@ -252,10 +252,6 @@ def _with_samples_of(scene: Scene, whole: Survey) -> Survey:
     otherwise = bool(late) or scene.psi[0] < 0 or scene.centred
     seen = (_Seen(late_s=late, sign=scene.psi[0], centred=scene.centred),) if otherwise else ()
     return replace(whole.making, channels=(replace(channel, site=site, effects=(*seen, *channel.effects)),))
-
-
-def _periods(motion: ScanModel | None) -> tuple[float, float]:
-    return (0.0, 0.0) if motion is None else (motion.spin_period_s, motion.precession_period_s)
 
 
 def _survey(run: config.RunConfig, scene: Scene) -> Survey:

@@ -131,7 +131,7 @@ class DataSet(ABC, Generic[Data]):
 
     def respond(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return changes of the data vector by effects, (rows, p), in ``skies`` skies or those of the reference."""
-        return self._simulated(found) - self.context.reference(found)
+        return np.concatenate(self.ask(after_jobs(self.context.analysis, found))) - self.context.reference(found)
 
     @property
     def extended(self) -> Vector:
@@ -158,10 +158,6 @@ class DataSet(ABC, Generic[Data]):
         """
         share = (1.0 / self.realizations + 1.0 / len(changes)) / (len(changes) - 1.0)
         return np.asarray(np.sqrt(share) * (changes - changes.mean(axis=0)).T)
-
-    def _simulated(self, found: Sequence[config.Effect]) -> Matrix:
-        """Return the data vectors of the skies of the reference with effects, shape (rows, p)."""
-        return np.concatenate(self.ask(after_jobs(self.context.analysis, found)))
 
     def pair(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix] | None:
         """Return data vectors of the same skies without effects and with them; None if errors do not need them."""

@@ -7,7 +7,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim import systematics
 from mcsim.datavector.analysis import Analysis
 from mcsim.datavector.campaign import with_effects
 from mcsim.datavector.candidate import Candidate
@@ -17,7 +16,7 @@ from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Alm, Vector, divided
-from mcsim.systematics import Effect
+from mcsim.systematics import Effect, looked_at
 
 Maps = NDArray[np.float64]
 Orders = NDArray[np.complex128]  #: of a beam, shape (mmax + 1, lmax + 1)
@@ -88,17 +87,13 @@ class Derivative:
             change = sky
             if self.minus is not None:
                 other = self.minus.channels[number]
-                upper, lower = (_looked_at(one, sky, realization) for one in (channel, other))
+                upper, lower = (looked_at(one.effects, sky, one.site, 0, realization) for one in (channel, other))
                 change = (upper - lower) / self.width
             if last is None or not np.array_equal(change, last):
                 last, maps = change, observe(change)
             found.append(maps[first : first + len(channel.maps)])
             first += len(channel.maps)
         return np.concatenate(found)
-
-
-def _looked_at(channel: Channel, sky: Alm, realization: int) -> Alm:
-    return systematics.looked_at(channel.effects, sky, channel.site, 0, realization)
 
 
 def _maps(shared: Survey, sky: Alm, realization: int, with_dipole: bool) -> Maps:
@@ -207,7 +202,7 @@ def _power_factor(fiducial: Survey, effect: Effect, coordinates: NDArray[np.floa
     empty = np.zeros(alm_.size(lmax), dtype=np.complex128)
     power = np.zeros(lmax + 1)
     for realization in range(DRAWS):
-        drawn = systematics.looked_at((effect,), empty, site, fiducial.config.ensemble.seed, realization)
+        drawn = looked_at((effect,), empty, site, fiducial.config.ensemble.seed, realization)
         power += alm_.power(drawn, lmax)
     power /= DRAWS * (2.0 * np.arange(lmax + 1) + 1.0) * float(np.linalg.norm(coordinates))
     return divided(power, 2.0 * fiducial.cl)

@@ -221,7 +221,8 @@ def _of_maps(scene: Scene) -> Iterator[Structure]:
             kept = [i for i in views if factors[scene.views[i].split] != 0.0]
             weights = np.array([factors[scene.views[i].split] for i in kept])
             for stage, acts_on, frame, kind, keys, mix in _forms(scene, split, kept):
-                if name is None and split == ALIKE and (_fixed(frame, kind) or stage in ("square", "cube")):
+                fixed = frame == "sky" and not kind.startswith("orientation")
+                if name is None and split == ALIKE and (fixed or stage in ("square", "cube")):
                     if stage != "added" or kind not in ALSO_COMMON:
                         continue  # what all maps see alike is the sky itself, which the model knows as random
                     stage, frame = "power", ""
@@ -242,11 +243,6 @@ def _tried(scene: Scene, kind: str) -> float:
     if kind.startswith("source"):
         return scene.places
     return float(len(LOBES)) if kind.startswith("crossing") else 1.0
-
-
-def _fixed(frame: str, kind: str) -> bool:
-    """Return True for a pattern fixed to the sky that does not turn with the beam."""
-    return frame == "sky" and not kind.startswith("orientation")
 
 
 def _splits(splits: Sequence[str]) -> Iterator[tuple[str, tuple[float, ...]]]:
