@@ -9,9 +9,8 @@ import pytest
 import tomli_w
 from scipy.stats import ks_2samp
 
-import mcsim
 from instruments import two_channels
-from mcsim import cli, config, systematics
+from mcsim import config, systematics
 from mcsim.datavector import campaign
 from mcsim.datavector.analysis import analysis_of, data_vectors
 from mcsim.datavector.campaign import seeded, with_effects
@@ -21,6 +20,7 @@ from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.nuisance import Regression
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.ensemble.maps import file_names
 from mcsim.simulation import simulate
 from mcsim.simulation.nuisance import draws, tables
@@ -142,7 +142,7 @@ def test_a_calibration_far_beyond_its_prior_is_named(run, declared):
     assert best.amplitude == pytest.approx(10.0 * WIDTH, abs=4.0 * best.sigma)
 
 
-def test_the_command_lists_and_writes_nuisances(run, tmp_path, monkeypatch, capsys):
+def test_the_command_lists_and_writes_nuisances(run, mcsim, tmp_path, monkeypatch):
     monkeypatch.setattr(api, "batch", lambda workers: campaign.batch(0))  # in this process
     monkeypatch.chdir(tmp_path)
     channel = MODEL["channel"][1]
@@ -156,41 +156,32 @@ def test_the_command_lists_and_writes_nuisances(run, tmp_path, monkeypatch, caps
     for name, map_uk in zip(config.map_names(small), maps_of(small, calibration(2.0 * WIDTH)), strict=True):
         healpy.write_map(tmp_path / "data" / names[name], map_uk, coord="E", column_units="uK", dtype=np.float64)
 
-    def mcsim_(*said):
-        monkeypatch.setattr("sys.argv", ["mcsim", *said])
-        code = 0
-        try:
-            cli.main()
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        return code, capsys.readouterr()
-
     without = [word for name in WITHOUT for word in ("--without", name)]
-    code, said = mcsim_("diagnose", "model.toml", "data", "-o", "out", "--dry-run", *without)
+    code, said, _ = mcsim("diagnose", "model.toml", "data", "-o", "out", "--dry-run", *without)
     assert code == 0
-    assert "nuisance: calibration of W1: 0.00 % ± 0.30 % of the gain" in said.out
+    assert "nuisance: calibration of W1: 0.00 % ± 0.30 % of the gain" in said
     with quick_pictures(empty=True):
-        code, said = mcsim_("diagnose", "model.toml", "data", "-o", "out", "--simulations", "150", *without)
+        code, said, _ = mcsim("diagnose", "model.toml", "data", "-o", "out", "--simulations", "150", *without)
     assert code == 0
-    assert "nuisance      calibration of W1" in said.out
+    assert "nuisance      calibration of W1" in said
     verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
     one, two = verdict["nuisances"]
     assert (one["name"], one["channel"], one["prior_width"]) == ("calibration", "W1", WIDTH)
     assert abs(one["amplitude"] - 2.0 * WIDTH) < 4.0 * one["sigma"]
     assert two["name"] == "noise_level"
-    found = mcsim.diagnosis.result.DiagnosisResult.open(tmp_path / "out")
+    found = DiagnosisResult.open(tmp_path / "out")
     assert found.to_json() == verdict
     with quick_pictures(empty=True):
         assert "Known unknowns" in report.page(found)
     assert words.pulled(found.nuisances[0]).startswith("; pull ")
-    assert mcsim_("config", "model.toml")[0] == 0
+    assert mcsim("config", "model.toml")[0] == 0
     table["nuisance"] = [{"effect": "noise_level", "channel": "W1", "width": 0.5}]
     (tmp_path / "wide.toml").write_text(tomli_w.dumps(table))
     for command in (("config", "wide.toml"), ("diagnose", "wide.toml", "data", "-o", "new")):
-        code, said = mcsim_(*command)
+        code, _, said = mcsim(*command)
         assert code == 2
-        assert "noise_level" in said.err
-        assert said.err.count("\n") == 1
+        assert "noise_level" in said
+        assert said.count("\n") == 1
     assert not (tmp_path / "new" / "verdict.json").exists()
 
 

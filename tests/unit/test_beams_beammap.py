@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from astropy.io import fits
-from scipy.special import gammaln
 
+from harmonics import legendre
 from mcsim import config
 from mcsim.instrument.beams import Beam, BeamMap, blm_of_map, find_centre, read_map
 from mcsim.simulation.channels import load_beam_map
@@ -16,16 +16,8 @@ SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 
 
 def spherical_harmonics(lmax: int, m: int, theta: float, phi: float) -> np.ndarray:
-    """Y_lm(theta, phi) for l = 0..lmax by the recurrence in l."""
-    y = np.zeros(lmax + 1)
-    log_norm = 0.5 * (np.log((2 * m + 1) / (4 * np.pi)) + gammaln(2 * m + 1)) - gammaln(m + 1) - m * np.log(2)
-    y[m] = (-1) ** m * np.exp(log_norm) * np.sin(theta) ** m
-    for ell in range(m + 1, lmax + 1):
-        factor = np.sqrt((4 * ell**2 - 1) / (ell**2 - m**2))
-        y[ell] = factor * np.cos(theta) * y[ell - 1]
-        if ell > m + 1:
-            y[ell] -= factor * np.sqrt(((ell - 1) ** 2 - m**2) / (4 * (ell - 1) ** 2 - 1)) * y[ell - 2]
-    return y * np.exp(1j * m * phi)
+    """Y_lm(theta, phi) for l = 0..lmax."""
+    return legendre(lmax, m, np.array([theta]))[:, 0] * np.exp(1j * m * phi)
 
 
 def directions(size: int, centre: tuple[float, float], projection: str = "equidistant"):
