@@ -11,6 +11,7 @@ from mcsim.datavector.analysis import Job, analysis_of, data_vectors
 from mcsim.datavector.campaign import with_effects
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.context import DiagnosisContext, context
+from mcsim.reconstruction import simulated_scores
 from mcsim.simulation.survey import Survey, survey
 from mcsim.support.arrays import Matrix
 
@@ -60,10 +61,19 @@ def ask(jobs: Iterable[Job]) -> list[Matrix]:
     return [data_vectors(job) for job in jobs]
 
 
+def scored(jobs: Iterable[Job]) -> list[Matrix]:
+    """Simulate scores in this process."""
+    return [simulated_scores.scores(job) for job in jobs]
+
+
+def learned(table: dict[str, Any], *more: str, simulations: int = 260) -> DiagnosisContext:
+    """Return what is learned of a run, with PROPOSED effects and ``more`` alone."""
+    without = [name for name in systematics.catalogue() if name not in (*PROPOSED, *more)]
+    analysis = analysis_of(config.load(table), without=without, settings=DiagnosisSettings(beam_orders=2))
+    return context(analysis, *campaign.learned(analysis, ask, simulations, time_ordered=False))
+
+
 @lru_cache(maxsize=1)
 def learned_small() -> DiagnosisContext:
     """Return what is learned of the small instrument, with PROPOSED effects alone."""
-    run = config.load(two_channels("small"))
-    without = [name for name in systematics.catalogue() if name not in PROPOSED]
-    analysis = analysis_of(run, without=without, settings=DiagnosisSettings(beam_orders=2))
-    return context(analysis, *campaign.learned(analysis, ask, 260, time_ordered=False))
+    return learned(two_channels("small"))

@@ -9,7 +9,7 @@ import healpy
 import numpy as np
 import pytest
 
-from instruments import ask, data_of, learned_small
+from instruments import ask, data_of, learned_small, scored
 from mcsim import systematics
 from mcsim.diagnosis import report, unlisted, words
 from mcsim.diagnosis.inference import diagnose_data
@@ -24,10 +24,6 @@ from pictures import quick_pictures
 @pytest.fixture(scope="module")
 def small():
     return learned_small()
-
-
-def scored(jobs):
-    return [simulated_scores.scores(job) for job in jobs]
 
 
 def test_a_described_pattern_has_its_size(small):

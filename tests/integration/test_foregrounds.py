@@ -1,16 +1,15 @@
 """The spectral index of a residual foreground: fitted where two differences of channels tell it, and only there."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from instruments import data_of, two_channels
+from instruments import ask, data_of, two_channels
 from mcsim import config, systematics
 from mcsim.datavector import campaign
-from mcsim.datavector.analysis import Analysis, Job, analysis_of, data_vectors
+from mcsim.datavector.analysis import Analysis, analysis_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.context import DiagnosisContext, context
 from mcsim.diagnosis.inference import diagnose_data
@@ -34,10 +33,6 @@ def small(clean: bool) -> Analysis:
         scan_sims=60, beam_orders=1, split_beam_orders=1, response_modes=1 << 12
     )  # nothing here is of a beam
     return analysis_of(config.load(table), without=without, settings=settings)
-
-
-def ask(jobs: Sequence[Job]) -> list[np.ndarray]:
-    return [data_vectors(job) for job in jobs]
 
 
 @pytest.fixture(scope="module")

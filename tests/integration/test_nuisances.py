@@ -9,7 +9,7 @@ import pytest
 import tomli_w
 from scipy.stats import ks_2samp
 
-from instruments import two_channels
+from instruments import ask, two_channels
 from mcsim import config, systematics
 from mcsim.datavector import campaign
 from mcsim.datavector.analysis import analysis_of, data_vectors
@@ -39,10 +39,6 @@ MODEL = two_channels("company", sigma0_uk=60.0) | {
     ],
 }
 SIMULATIONS, SKIES = 400, 320
-
-
-def ask(jobs):
-    return [data_vectors(job) for job in jobs]
 
 
 def small_analysis(run):

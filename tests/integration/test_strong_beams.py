@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from instruments import PROPOSED, ask, data_of, two_channels
-from mcsim import config, systematics
-from mcsim.datavector import campaign
-from mcsim.datavector.analysis import analysis_of
-from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.diagnosis.context import context
+from instruments import ask, data_of, learned, two_channels
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.simulation import simulate
@@ -16,10 +11,7 @@ from mcsim.simulation import simulate
 
 @pytest.fixture(scope="module")
 def model():
-    run = config.load(two_channels("small"))
-    without = [name for name in systematics.catalogue() if name not in (*PROPOSED, "calibration", "beam_width")]
-    analysis = analysis_of(run, without=without, settings=DiagnosisSettings(beam_orders=2))
-    return context(analysis, *campaign.learned(analysis, ask, 260, time_ordered=False))
+    return learned(two_channels("small"), "calibration", "beam_width")
 
 
 @pytest.mark.parametrize("amplitude", [-0.3, -0.08, 0.08])

@@ -3,14 +3,10 @@
 import numpy as np
 import pytest
 
-from instruments import PROPOSED, ask, data_of, two_channels
-from mcsim import config, systematics
-from mcsim.datavector import campaign
-from mcsim.datavector.analysis import analysis_of
+from instruments import ask, data_of, learned, scored, two_channels
+from mcsim import config
 from mcsim.datavector.campaign import with_effects
-from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import unlisted
-from mcsim.diagnosis.context import context
 from mcsim.diagnosis.fitted_nuisances import FittedNuisances
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
@@ -25,19 +21,12 @@ SEED = 78
 def model():
     """Return what is learned of an instrument whose calibrations are uncertain by 0.2 % (S/N about 85)."""
     calibrations = [{"effect": "calibration", "channel": name, "width": 0.002} for name in ("V1", "W1")]
-    run = config.load({**two_channels("small"), "nuisance": calibrations})
-    without = [name for name in systematics.catalogue() if name not in (*PROPOSED, "calibration")]
-    analysis = analysis_of(run, without=without, settings=DiagnosisSettings(beam_orders=2))
-    return context(analysis, *campaign.learned(analysis, ask, 260, time_ordered=False))
+    return learned({**two_channels("small"), "nuisance": calibrations}, "calibration")
 
 
 @pytest.fixture(scope="module")
 def scene(model):
     return simulated_scores.scene_for(model.analysis.job(model.run))
-
-
-def scored(jobs):
-    return [simulated_scores.scores(job) for job in jobs]
 
 
 def observed(model, realization, *effects):

@@ -4,19 +4,14 @@ import healpy
 import numpy as np
 import pytest
 
-from instruments import ask, data_of, learned_small
+from instruments import ask, data_of, learned_small, scored
 from mcsim.diagnosis import unlisted
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
-from mcsim.reconstruction import simulated_scores
 from mcsim.simulation import simulate
 from mcsim.sphere import rng
 
 LMAX, NSIDE, FIRST = 40, 16, 9
-
-
-def scored(jobs):
-    return [simulated_scores.scores(job) for job in jobs]
 
 
 def pattern(first):

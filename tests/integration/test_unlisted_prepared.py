@@ -4,13 +4,8 @@ import healpy
 import numpy as np
 import pytest
 
-from instruments import PROPOSED, ask, data_of, two_channels
-from mcsim import config, systematics
-from mcsim.datavector import campaign
-from mcsim.datavector.analysis import analysis_of
-from mcsim.datavector.settings import DiagnosisSettings
+from instruments import ask, data_of, learned, scored, two_channels
 from mcsim.diagnosis import unlisted
-from mcsim.diagnosis.context import context
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.reconstruction import simulated_scores
 from mcsim.simulation import simulate
@@ -31,14 +26,8 @@ def prepared(tmp_path_factory):
     table["map"] = {"nside": 32, "mask": path, "mask_frame": "ecliptic"}
     table["biposh"]["lmax"] = 16
     outside = {"kind": "subtract_dipole", "mask": path, "mask_frame": "ecliptic"}
-    run = config.load(table | {"preparation": [{"kind": "degrade", "nside": NSIDE}, outside]})
-    without = [name for name in systematics.catalogue() if name not in PROPOSED]
-    analysis = analysis_of(run, without=without, settings=DiagnosisSettings(beam_orders=2))
-    return context(analysis, *campaign.learned(analysis, ask, 220, time_ordered=False))
-
-
-def scored(jobs):
-    return [simulated_scores.scores(job) for job in jobs]
+    table["preparation"] = [{"kind": "degrade", "nside": NSIDE}, outside]
+    return learned(table, simulations=220)
 
 
 def test_a_pattern_on_the_sky_of_prepared_maps_is_described(prepared):
