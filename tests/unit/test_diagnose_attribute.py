@@ -381,19 +381,23 @@ def test_what_is_detected_beside_an_effect_stands_out_of_the_scatter_that_it_add
 UNSURE = Measured(0.0, 100.0)
 
 
+def judged(bench: Bench, shrink: HeldOut) -> tuple[str, HeldOut | None, list[str]]:
+    """Verdict on a set that all data name, whose reduction in other data is this; what is kept of that; notes."""
+    found = bench.diagnose_maps(12.0 * bench.t[:, 3], 0)
+    assert found.verdict == "effect"
+    notes: list[str] = []
+    context = SimpleNamespace(candidates=bench.candidates, settings=DiagnosisSettings())
+    after, kept = confirmed(context, found, shrink, notes)
+    return after.verdict, kept, notes
+
+
 @pytest.mark.parametrize(("achieved", "named"), [(0.9, True), (-0.5, True), (-2.0, False)])
 def test_set_that_opens_the_gap_is_not_named(bench, achieved, named):
     """Three standard deviations below zero: what fits best, simulated, made it worse."""
-    found = bench.diagnose_maps(12.0 * bench.t[:, 3], 0)
-    assert found.verdict == "effect"
-    context = SimpleNamespace(candidates=bench.candidates, settings=DiagnosisSettings())
     after = Measured(100.0 * (1.0 - achieved), 10.0)
     shrink = HeldOut(UNSURE, Measured(achieved, 0.5), Measured(100.0, 10.0), after, 0.5, "half2")
-    notes: list[str] = []
-    judged, kept = confirmed(context, found, shrink, notes)
-    assert (judged.verdict, kept is shrink, bool(notes)) == (
-        ("effect", True, False) if named else ("unknown", False, True)
-    )
+    verdict, kept, notes = judged(bench, shrink)
+    assert (verdict, kept is shrink, bool(notes)) == (("effect", True, False) if named else ("unknown", False, True))
     assert named or ("effect3" in notes[0] and "from 100 to 300" in notes[0])
 
 
@@ -409,13 +413,10 @@ def test_set_that_opens_the_gap_is_not_named(bench, achieved, named):
     ],
 )
 def test_set_that_closes_less_than_half_of_what_was_forecast_is_not_named(bench, achieved, forecast, error, named):
-    found = bench.diagnose_maps(12.0 * bench.t[:, 3], 0)
-    context = SimpleNamespace(candidates=bench.candidates, settings=DiagnosisSettings())
     before, after = Measured(100.0, 10.0), Measured(100.0 * (1.0 - achieved), 10.0)
     shrink = HeldOut(Measured(forecast, 0.15), Measured(achieved, error), before, after, 0.5, "half2")
-    notes: list[str] = []
-    judged, _ = confirmed(context, found, shrink, notes)
-    assert judged.verdict == ("effect" if named else "unknown")
+    verdict, _, notes = judged(bench, shrink)
+    assert verdict == ("effect" if named else "unknown")
     assert named or ("180" if achieved < 0.0 else "35 %") in notes[0]
 
 
@@ -429,13 +430,10 @@ def test_set_that_closes_less_than_half_of_what_was_forecast_is_not_named(bench,
 )
 def test_set_that_leaves_a_significant_half_is_not_named(bench, achieved, pvalue, named):
     """A half that asks for no effect predicts no reduction; the other half then decides."""
-    found = bench.diagnose_maps(12.0 * bench.t[:, 3], 0)
-    context = SimpleNamespace(candidates=bench.candidates, settings=DiagnosisSettings())
     before, after = Measured(100.0, 20.0), Measured(100.0 * (1.0 - achieved), 20.0)
     shrink = HeldOut(Measured(-0.08, 0.06), Measured(achieved, 0.066), before, after, pvalue, "half2")
-    notes: list[str] = []
-    judged, _ = confirmed(context, found, shrink, notes)
-    assert judged.verdict == ("effect" if named else "unknown")
+    verdict, _, notes = judged(bench, shrink)
+    assert verdict == ("effect" if named else "unknown")
     assert named or "what remains differs from the simulations" in notes[0]
 
 
@@ -460,11 +458,8 @@ def test_what_remains_is_said_to_differ_only_if_it_does():
 @pytest.mark.parametrize(("after", "named"), [(15.0, True), (80.0, False)])
 def test_half_without_a_gap_measures_no_shrink(bench, before, after, named):
     """Shares of nothing are large, of either sign, and say nothing; a gap that is opened is one from nothing too."""
-    found = bench.diagnose_maps(12.0 * bench.t[:, 3], 0)
-    context = SimpleNamespace(candidates=bench.candidates, settings=DiagnosisSettings())
     share = Measured(1.0 - after / before, 12.0)
-    notes: list[str] = []
     shrink = HeldOut(UNSURE, share, Measured(before, 12.0), Measured(after, 12.0), 0.5, "half2")
-    judged, kept = confirmed(context, found, shrink, notes)
-    assert (judged.verdict, kept) == ("effect" if named else "unknown", None)
+    verdict, kept, notes = judged(bench, shrink)
+    assert (verdict, kept) == ("effect" if named else "unknown", None)
     assert ("No reduction" if named else "is not named") in notes[0]
