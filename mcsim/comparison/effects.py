@@ -19,7 +19,7 @@ from mcsim.simulation.channels import table_of
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.support.arrays import Alm, Vector
-from mcsim.systematics import Effect
+from mcsim.systematics import Effect, acts_through
 from mcsim.systematics.registry import basis_of, catalogue
 
 REDUNDANT = ("monopole_residual", "pixelization", "spectrum")
@@ -63,7 +63,7 @@ class EffectDifference(Difference):
     def within(self, value: Vector) -> Vector:
         """Return the coordinates, or smaller ones in proportion whose response is possible."""
         size = float(value @ self._products @ value) / max(self._largest, 1e-300)
-        if not self.linear or all(getattr(self.kind, stage) is getattr(Effect, stage) for stage in BEAM_STAGES):
+        if not self.linear or not acts_through(self.kind, *BEAM_STAGES):
             highest = min([np.inf, *(max(-b.low, b.high) for b in self.kind.bounds if b.parameter == "amplitude")])
             size = (self.amplitude(value) / highest) ** 2
         return value / max(1.0, float(np.sqrt(size)))
@@ -182,9 +182,8 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
 
     bare = made(alone)
     for name, kind in catalogue().items():
-        acts = any(getattr(kind, stage) is not getattr(Effect, stage) for stage in STAGES)
         redundant = name in REDUNDANT or (name == GAIN and not run.sky.dipole_uk)
-        if kind.parametrization.stochastic or redundant or not kind.proposed or not acts:
+        if kind.parametrization.stochastic or redundant or not kind.proposed or not acts_through(kind, *STAGES):
             continue
         templates = []
         try:

@@ -24,7 +24,7 @@ from mcsim.simulation.nuisance import DisturbedSurvey, Nuisance, check_nuisances
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.support.arrays import Alm, Map, Vector
-from mcsim.systematics import Effect, Library
+from mcsim.systematics import Effect, Library, acts_through
 
 Kinds = tuple[tuple[str, type[Effect]], ...]  #: effects of a library by name, as they are sent to workers
 
@@ -187,11 +187,11 @@ def _hindrance(model: Model, kind: type[Effect], channel: str | None, settings: 
     HookError for one whose hooks fail.
     """
     owners = [c for c in model.survey.channels if channel in (None, c.name)]
-    if kind.differencing is not Effect.differencing and any(owner.side_b is None for owner in owners):
+    if acts_through(kind, "differencing") and any(owner.side_b is None for owner in owners):
         return "it acts on differencing, and the scan has none"
-    if kind.excess is not Effect.excess and any(owner.side_b is not None for owner in owners):
+    if acts_through(kind, "excess") and any(owner.side_b is not None for owner in owners):
         return "it disturbs the samples of one beam, and the scan takes differences of two"
-    if kind.orientations is not Effect.orientations:
+    if acts_through(kind, "orientations"):
         scans = [spec.scan for spec in model.survey.config.channels if channel in (None, spec.name)]
         if not all(isinstance(scan, config.ScanParallelTransport) for scan in scans):
             return "it acts on the orientations of parallel transport, and the scan has its own"
@@ -207,7 +207,7 @@ def _hindrance(model: Model, kind: type[Effect], channel: str | None, settings: 
     except InputError as error:
         return str(error).rstrip(".")
     quiet = all(m.noise_uk is None for owner in owners for m in owner.maps)
-    if quiet and (kind.noise is not Effect.noise or kind.excess is not Effect.excess):
+    if quiet and acts_through(kind, "noise", "excess"):
         return "it acts on noise, and the maps have none"
     return None
 
@@ -225,7 +225,7 @@ def check_asked(analysis: Analysis, names: Sequence[str]) -> None:
 
 def _step(model: Model, kind: type[Effect], channel: str | None) -> float | None:
     """Return the amplitude at which responses are measured if it depends on the model: iterations of map-making."""
-    if kind.differencing is Effect.differencing or kind(amplitude=kind.step).differencing(0.0, 0)[1] == 0:
+    if not acts_through(kind, "differencing") or kind(amplitude=kind.step).differencing(0.0, 0)[1] == 0:
         return None
     (owner,) = (c for c in model.survey.making.channels if c.name == channel)
     return float(differencing.iterations_to_spare(owner, simulate.draw_sky(model.survey, 0)))
@@ -235,7 +235,7 @@ def _matched_blocks(model: Model, candidates: Sequence[Candidate]) -> Iterator[B
     for candidate in candidates:
         channels = model.channels if candidate.channel is None else (candidate.channel,)
         where = None if candidate.channel is None else model.channels.index(candidate.channel)
-        if candidate.effect.differencing is not Effect.differencing:
+        if acts_through(candidate.effect, "differencing"):
             yield from _blocks_by_map(model, candidate)
             continue
         for number, basis in enumerate(candidate.basis):

@@ -19,7 +19,7 @@ from mcsim.simulation.survey import Channel, SurveyMap
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Map
-from mcsim.systematics import Effect
+from mcsim.systematics import Effect, acts_through
 
 MatchedFilter = Callable[[FilteredMaps], float]
 
@@ -29,16 +29,16 @@ def matched_filter(model: Model, effect: Effect, channel: int | None) -> Matched
 
     None if there is no such filter.
     """
-    kind, owner = type(effect), model.survey.channels[channel or 0]
-    if not kind.parametrization.matched_filter:
+    owner = model.survey.channels[channel or 0]
+    if not effect.parametrization.matched_filter:
         return None
-    if kind.sky is not Effect.sky:
+    if acts_through(effect, "sky"):
         return _sky_filter(model, effect, channel)
     if channel is None:
         return None
-    if kind.beam is not Effect.beam or kind.pointing is not Effect.pointing or kind.spread is not Effect.spread:
+    if acts_through(effect, "beam", "pointing", "spread"):
         return _beam_filter(model, effect, channel)
-    if kind.signal is not Effect.signal:
+    if acts_through(effect, "signal"):
         return _signal_filter(model, effect, channel)
     factor = effect.noise(owner.site)
     if factor is not None:

@@ -117,8 +117,7 @@ class SameSkies:
     def _changes_power(self, effect: config.Effect) -> bool:
         """Return True for what a beam, or a pixel, does to the power of the sky of the only channel."""
         kind, alone = dict(self.analysis.library)[effect.name], len(self.analysis.model.channels) == 1
-        shapes = kind.beam is not systematics.Effect.beam or kind.spread is not systematics.Effect.spread
-        return alone and shapes
+        return alone and systematics.acts_through(kind, "beam", "spread")
 
     def ahead(self, each: Sequence[config.Effect], skies: int) -> None:
         """Simulate single effects at once that :meth:`of_reference` or :meth:`pair` will be asked for one by one.

@@ -20,7 +20,7 @@ from mcsim.errors import InputError
 from mcsim.simulation import simulate
 from mcsim.sphere.rotation import FRAMES, rotate_biposh
 from mcsim.support.arrays import Vector
-from mcsim.systematics import Effect, Library
+from mcsim.systematics import Library, acts_through
 
 _SPECTRAL_HOOKS = ("sky", "beam", "pointing", "spread", "orientations", "noise", "excess")
 """Hooks that change spectra of a map. Gains and signals of samples do so in the lowest degrees only, and are no
@@ -196,11 +196,7 @@ def analysis_of_spectra(
 
     Arguments are those of :func:`~mcsim.datavector.analysis.analysis_of`.
     """
-    excluded = [
-        name
-        for name, kind in kinds_of(library)
-        if all(getattr(kind, hook) is getattr(Effect, hook) for hook in _SPECTRAL_HOOKS)
-    ]
+    excluded = [name for name, kind in kinds_of(library) if not acts_through(kind, *_SPECTRAL_HOOKS)]
     settings = (settings or DiagnosisSettings()).without_shrinkage()
     analysis = analysis_of(run, (*without, *excluded), nthreads, settings, library)
     return replace(analysis, blocks=(Block(measured.elements, lambda filtered: measured.value),), of_maps=False)

@@ -16,7 +16,7 @@ from mcsim.sphere.rotation import FRAMES
 from mcsim.stats.gaussian import SimulatedGaussian, Tolerated
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.numbers import number, p_equals
-from mcsim.systematics import Effect
+from mcsim.systematics import Effect, acts_through
 
 Rows = NDArray[np.int64]
 
@@ -157,7 +157,7 @@ class Slices:
         if scatters and not self.scatters:
             return replace(self, scatters=scatters, nulls={}).findings(candidates, actions)
         # More noise, or a pattern that is drawn, is more of chi^2: what is left in the maps then says nothing of it.
-        noisy = any(one.effect.noise is not Effect.noise or one.parametrization.stochastic for one in candidates)
+        noisy = any(acts_through(one.effect, "noise") or one.parametrization.stochastic for one in candidates)
         free = np.concatenate([action.directions for action in actions], axis=1)
         comparisons = []
         for place, (candidate, action) in enumerate(zip(candidates, actions, strict=True)):
@@ -187,7 +187,7 @@ class Slices:
         halves = [[row for row, e in own if e.fold == fold] for fold in (0, 1)]
         words = tuple(" and ".join(self.splits[fold::2]) for fold in (0, 1)) if len(self.splits) > 1 else _HALVES
         yield _of_rows("halves", words, halves)
-        noisy = candidate.effect.noise is not Effect.noise  # it shows in differences of splits, and in pixels
+        noisy = acts_through(candidate.effect, "noise")  # it shows in differences of splits, and in pixels
         ends = {e for e in (LARGE, max(LARGE, bins(2, self.lmax, 2)[0][1])) if e < self.lmax}
         edges = [e for _, e in scales(self.lmax)] if noisy else sorted({*ends, self.lmax})
         starts = (0, *(edge + 1 for edge in edges))

@@ -89,7 +89,7 @@ def scanned_beams(survey: Survey, L_max: int, nthreads: int = 1) -> tuple[Scanne
 def _check_covered(channel: Channel) -> None:
     """Raise InputError for an effect that changes more than the beam, its orientations and the noise."""
     for effect in channel.effects:
-        changed = [hook for hook in _LEFT_OUT if getattr(type(effect), hook) is not getattr(systematics.Effect, hook)]
+        changed = [hook for hook in _LEFT_OUT if systematics.acts_through(effect, hook)]
         if effect.amplitude != 0.0 and changed:
             raise InputError(
                 f"effect {effect.name} on channel {channel.name} acts on the {changed[0]}, which predictions do not "
@@ -151,7 +151,7 @@ def _orientations(
             harmonics = spin_functions(rings.s, L_max, rings.theta)[rings.s]
             result[rings.s, :, L_max] = rings.phase * (harmonics @ rings.weight)
         return result
-    turned = any(type(one).orientations is not systematics.Effect.orientations for one in channel.effects)
+    turned = any(systematics.acts_through(one, "orientations") for one in channel.effects)
     plain = m.weight is None and m.preparation is None and not turned
     if isinstance(scan, config.ScanParallelTransport) and plain:
         return parallel_transport_harmonics(smax, L_max, float(np.deg2rad(scan.psi0_deg)))

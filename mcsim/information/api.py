@@ -238,7 +238,7 @@ def _candidates(
     settings = replace(settings, only=tuple(only), without=tuple(without))
     named = dict.fromkeys((*settings.only, *(name.partition(":")[0] for name in settings.nuisances)))
     for name in named:
-        if name in library and library[name].excess is not systematics.Effect.excess:
+        if name in library and systematics.acts_through(library[name], "excess"):
             raise InputError(
                 f"{name} adds noise at random to samples, of which the limit knows nothing; ask for noise_level, whose "
                 "response is nearly the same."

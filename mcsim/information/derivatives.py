@@ -16,7 +16,7 @@ from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Alm, Vector, divided
-from mcsim.systematics import Effect, looked_at
+from mcsim.systematics import Effect, acts_through, looked_at
 
 Maps = NDArray[np.float64]
 Orders = NDArray[np.complex128]  #: of a beam, shape (mmax + 1, lmax + 1)
@@ -148,7 +148,7 @@ def _derivative(analysis: Analysis, candidate: Candidate, basis: Effect, observe
         factor = _power_factor(fiducial, replace(basis, amplitude=abs(basis.amplitude)), fit.coordinates(basis))
         own_survey = _quiet(survey(only, nthreads=nthreads, library=known))
         return Derivative(maps, own_survey, None, 1.0, observe, factor, np.zeros_like(dipole), noise, True)
-    changed = [name for name in _HOOKS if getattr(kind, name) is not getattr(Effect, name)]
+    changed = [name for name in _HOOKS if acts_through(kind, name)]
     if not run.effects and not set(changed) - {"beam", "pointing"}:
         channels = tuple(_difference(a, b, width) for a, b in zip(plus.channels, minus.channels, strict=True))
         return Derivative(maps, replace(plus, channels=channels), None, 1.0, None, None, dipole, noise, False)

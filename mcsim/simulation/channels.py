@@ -209,7 +209,7 @@ def _warn_of_orders(run: config.RunConfig, spec: config.Channel, beam: beams.Bea
 def refuse_excess(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
     """Refuse effects in a differencing scan that its samples, which are differences, do not have."""
     for effect in acting:
-        if effect.amplitude != 0.0 and type(effect).orientations is not systematics.Effect.orientations:
+        if effect.amplitude != 0.0 and systematics.acts_through(effect, "orientations"):
             raise InputError(
                 f"effect {effect.name} on channel {channel} acts on orientation moments, but the scan takes "
                 'differences, which have none; remove it, or give a scan of kind "hit_averaged".'
@@ -224,7 +224,7 @@ def refuse_excess(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
 def refuse_differences(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
     """Refuse effects on the differences of two beams where the scan takes none."""
     for effect in acting:
-        if effect.amplitude != 0.0 and type(effect).differencing is not systematics.Effect.differencing:
+        if effect.amplitude != 0.0 and systematics.acts_through(effect, "differencing"):
             raise InputError(
                 f"effect {effect.name} on channel {channel} acts on differences of two beams, but the scan takes none; "
                 'remove it, or give a scan of kind "differencing".'
@@ -262,12 +262,11 @@ def known_offsets(run: config.RunConfig, spec: config.Channel) -> int:
 def refuse_pixel_effects(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
     """Refuse effects that act on pixels, for a grid of rings."""
     for effect in acting:
-        for hook in ("gain", "signal", "noise", "excess", "spread", "orientations"):
-            if getattr(type(effect), hook) is not getattr(systematics.Effect, hook):
-                raise InputError(
-                    f'effect {effect.name} on channel {channel} acts on pixels, but grid = "gl" has none; remove it '
-                    'or set map.grid = "healpix".'
-                )
+        if systematics.acts_through(effect, "gain", "signal", "noise", "excess", "spread", "orientations"):
+            raise InputError(
+                f'effect {effect.name} on channel {channel} acts on pixels, but grid = "gl" has none; remove it or set '
+                'map.grid = "healpix".'
+            )
 
 
 def site_of(run: config.RunConfig, spec: config.Channel) -> systematics.Site:

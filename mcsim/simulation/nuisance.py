@@ -18,7 +18,7 @@ from mcsim.simulation.pixel_means import Part, gain_of, mean_gain, mean_signal, 
 from mcsim.simulation.survey import Channel, Survey, survey, with_effects
 from mcsim.sphere import rng
 from mcsim.support.arrays import Vector
-from mcsim.systematics import Effect, Library, basis_of, seen_through, spread_of, tried
+from mcsim.systematics import Effect, Library, acts_through, basis_of, seen_through, spread_of, tried
 
 _OF_BEAMS = ("beam", "pointing", "spread")
 
@@ -75,7 +75,7 @@ class Nuisance:
     def subtractable(self) -> bool:
         """Return True if maps can be rid of it: it is linear, of either sign, and nothing of it is random."""
         how = self.effect.parametrization
-        random = how.stochastic or how.noise_alone or self.effect.noise is not Effect.noise
+        random = how.stochastic or how.noise_alone or acts_through(self.effect, "noise")
         return not (random or how.mean_response or how.nonlinear or how.sign or self.parameter_widths)
 
     def at(self, coordinates: Vector, **parameters: float) -> Effect:
@@ -231,7 +231,7 @@ class DisturbedSurvey:
         site = channel.site
         acting = (*channel.effects, *more)
         beam, response = channel.beam, channel.response
-        if any(getattr(type(effect), hook) is not getattr(Effect, hook) for effect in more for hook in _OF_BEAMS):
+        if any(acts_through(effect, *_OF_BEAMS) for effect in more):
             beam = seen_through(acting, site)
             beam = beam.truncated(min(beam.mmax, *(m.moments.smax for m in channel.maps)))
             response = convolve.response(beam, site.lmax, channel.window ** (spread_of(acting) ** 2))
@@ -251,7 +251,7 @@ class DisturbedSurvey:
 
     def _orders(self, channel: Channel) -> int:
         """Return the highest order that the beam of a channel can have in a realization."""
-        turned = any(getattr(n.effect, hook) is not getattr(Effect, hook) for n in self.nuisances for hook in _OF_BEAMS)
+        turned = any(acts_through(one.effect, *_OF_BEAMS) for one in self.nuisances)
         return max(m.moments.smax for m in channel.maps) if turned else channel.beam.mmax
 
     @cached_property
@@ -281,7 +281,7 @@ class DisturbedSurvey:
         for (number, one), channel in product(linear, self.survey.making.channels):
             of_orders = partial(gain_of, orders=self._orders(channel))
             for hook, mean in (("gain", of_orders), ("signal", signal_of)):
-                if getattr(one.effect, hook) is getattr(Effect, hook) or one.channel not in (None, channel.name):
+                if not acts_through(one.effect, hook) or one.channel not in (None, channel.name):
                     continue
                 basis = basis_of(one.effect, one.settings)
                 parts = [Part.of(self.survey.config, n) for n in range(len(channel.maps))]

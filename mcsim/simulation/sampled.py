@@ -83,7 +83,7 @@ def check(channel: Channel) -> None:
             'pointed where is not known; give it a scan of kind "hit_averaged", or moments with a scan model.'
         )
     for effect in channel.effects:
-        if type(effect).orientations is not systematics.Effect.orientations:
+        if systematics.acts_through(effect, "orientations"):
             raise InputError(
                 f"effect {effect.name} on channel {channel.name} acts on orientation moments, which samples do not "
                 "have; leave it out where the survey is simulated sample by sample."

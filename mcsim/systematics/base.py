@@ -27,6 +27,7 @@ Map = NDArray[np.float64]
 Draw = Callable[[str], np.random.Generator]
 """From the name of a stage to its stream of random numbers in this realization."""
 
+_NAMED_WITHIN_DEG = 5.0  #: of a direction that has a name
 UNIFORM = 1e-9  #: relative departure of a beam from a multiple of another one that is round-off
 
 
@@ -338,6 +339,12 @@ class DirectedEffect(Effect):
         return f"towards longitude {self.lon_deg:.0f}°, latitude {self.lat_deg:.0f}°".replace("-", "−")
 
 
+def acts_through(effect: Effect | type[Effect], *hooks: str) -> bool:
+    """Return True if an effect, or the effects of a class, act through one of these hooks."""
+    kind = effect if isinstance(effect, type) else type(effect)
+    return any(getattr(kind, hook) is not getattr(Effect, hook) for hook in hooks)
+
+
 def seen_through(acting: Sequence[Effect], site: Site, displacing: Sequence[Effect] | None = None) -> Beam:
     """Return the beam about the fiducial line of sight: every effect on its shape first, then all that displaces it.
 
@@ -389,14 +396,12 @@ def variance_factor(acting: Iterable[Effect], site: Site) -> Map | None:
 
 def adding(acting: Iterable[Effect]) -> list[Effect]:
     """Return the effects that add a signal to samples."""
-    return [one for one in acting if one.amplitude != 0.0 and type(one).signal is not Effect.signal]
+    return [one for one in acting if one.amplitude != 0.0 and acts_through(one, "signal")]
 
 
 def disturbing(acting: Iterable[Effect]) -> list[tuple[Effect, str]]:
     """Return the effects that add noise of their own to samples, with the names of their :func:`streams`."""
-    return [
-        (one, own) for one, own in streams(acting) if one.amplitude != 0.0 and type(one).excess is not Effect.excess
-    ]
+    return [(one, own) for one, own in streams(acting) if one.amplitude != 0.0 and acts_through(one, "excess")]
 
 
 def tried(acting: Sequence[Effect], site: Site) -> Beam:
@@ -443,6 +448,3 @@ def scan_direction(angle_deg: float, period_deg: float = 360.0) -> str:
         if abs(abs(angle) - at) < _NAMED_WITHIN_DEG:
             return words
     return f"at {angle:.0f}° to the scan".replace("-", "−")
-
-
-_NAMED_WITHIN_DEG = 5.0

@@ -21,7 +21,7 @@ from typing import Any
 
 from mcsim.errors import InputError
 from mcsim.systematics import base
-from mcsim.systematics.base import Bound, Effect
+from mcsim.systematics.base import Bound, Effect, acts_through
 from mcsim.systematics.hooks import HOOKS
 from mcsim.systematics.parametrization import Parametrization
 
@@ -110,7 +110,7 @@ def _flaw(kind: type[Effect]) -> str | None:
         return f"cannot be made ({type(error).__name__}: {error})"
     if not basis or sizes != {(len(basis),)}:
         return f"has a basis of {len(basis)} effects whose coordinates have other shapes: each needs ({len(basis)},)"
-    if all(getattr(kind, hook) is getattr(Effect, hook) for hook in HOOKS):
+    if not acts_through(kind, *HOOKS):
         return f"does nothing: it needs one of {', '.join(HOOKS)}"
     return None
 
