@@ -18,7 +18,7 @@ from mcsim.comparison.prediction import Set
 from mcsim.comparison.scene_differences import PixelWindow, Smoothing, TimeShift
 from mcsim.comparison.search import Problem
 from mcsim.comparison.shown_sky import with_shown_sky
-from mcsim.instrument.scan import MapGrid, write_moments_fits
+from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel, write_moments_fits
 from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import survey
 
@@ -291,23 +291,27 @@ def test_an_effect_through_another_sky_is_measured_there(name, change):
     assert drifting.amplitude == pytest.approx(0.02, rel=0.01)
 
 
+def seen_at(simulator: Simulator, model: ScanModel, line: LineOfSight) -> Maps:
+    """The sky at the directions of another scan, in the pixels of the simulator's own."""
+    known, observe = simulator.site.pointed(""), tod.sky_signal(simulator.sky, 32, PEAR, 1e-8, 1)
+    maps = []
+    for half in (0, 1):
+        grid = MapGrid(16, "ecliptic", (half / 2, (half + 1) / 2))
+        both = tod.samples(known.model, known.line, grid), tod.samples(model, line, grid)
+        stream = (replace(there, pixel=here.pixel) for here, there in zip(*both, strict=True))
+        mean, hits = tod.bin_samples(observe(stream), 16)
+        maps.append(np.where(hits > 0, mean, healpy.UNSEEN))
+    return maps
+
+
 @pytest.mark.slow
 def test_an_effect_beside_a_time_shift_is_that_of_late_samples():
     """Otherwise a shift of the beam's size and an offset across it are better explained by one offset of the two."""
     simulator = Simulator(small(), 0)
     known = simulator.site.pointed("")
     tilted = replace(known.line, boresight_angle_deg=known.line.boresight_angle_deg + 1.0)
-    later = known.model.ahead(601.0 * 0.003)
-    observe = tod.sky_signal(simulator.sky, 32, PEAR, 1e-8, 1)
-
-    def seen(half: int) -> NDArray[np.float64]:
-        grid = MapGrid(16, "ecliptic", (half / 2, (half + 1) / 2))
-        both = (tod.samples(model, line, grid) for model, line in ((known.model, known.line), (later, tilted)))
-        stream = (replace(there, pixel=here.pixel) for here, there in zip(*both, strict=True))
-        mean, hits = tod.bin_samples(observe(stream), 16)
-        return np.where(hits > 0, mean, healpy.UNSEEN)
-
-    pair = with_shown_sky(pairs.given(simulator(), [seen(0), seen(1)], simulator.run).pairs[0])
+    side_b = seen_at(simulator, known.model.ahead(601.0 * 0.003), tilted)
+    pair = with_shown_sky(pairs.given(simulator(), side_b, simulator.run).pairs[0])
     [offset] = [one for one in effects_of(pair, simulator.run) if one.name == "pointing_offset"]
     problem = Problem(pair, (), 0.0)
     members = ((TimeShift(), np.array([0.003])), (offset, np.array([0.0, -60.0])))
@@ -340,16 +344,7 @@ def test_the_model_may_describe_the_other_side(name, simulator, side_a):
 def test_time_stamps_a_whole_sample_off_are_named_however_far_that_is():
     simulator = Simulator(small())
     pointing = simulator.site.pointed("")
-    ahead = pointing.model.ahead(601.0)
-    observe = tod.sky_signal(simulator.sky, 32, PEAR, 1e-8, 1)
-
-    def late(half: int) -> NDArray[np.float64]:
-        grid = MapGrid(16, "ecliptic", (half / 2, (half + 1) / 2))
-        both = (tod.samples(model, pointing.line, grid) for model in (pointing.model, ahead))
-        stream = (replace(there, pixel=here.pixel) for here, there in zip(*both, strict=True))
-        mean, hits = tod.bin_samples(observe(stream), 16)
-        return np.where(hits > 0, mean, healpy.UNSEEN)
-
-    found = mcsim.compare(simulator(), [late(0), late(1)], simulator.run)
+    side_b = seen_at(simulator, pointing.model.ahead(601.0), pointing.line)
+    found = mcsim.compare(simulator(), side_b, simulator.run)
     assert names(found) == ["time_shift"]
     assert found.channels[0].differences[0].amplitude == 1.0

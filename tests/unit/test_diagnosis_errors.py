@@ -9,12 +9,16 @@ from mcsim.diagnosis.assemble import effects_of
 from mcsim.stats.gaussian import Fit
 
 
+def candidate_of(name: str) -> tuple[Candidate, int]:
+    """An effect of W1, and the number of its components."""
+    size = len(Candidate(systematics.get(name), "W1", ()).basis)
+    return Candidate(systematics.get(name), "W1", tuple(range(size))), size
+
+
 @pytest.mark.parametrize("name", ["beam_coma", "beam_ellipticity", "dipole_residual", "calibration"])
 def test_an_amplitude_is_no_more_errors_from_zero_than_chi2_falls(name: str) -> None:
     rng = np.random.default_rng(1)
-    effect = systematics.get(name)
-    size = len(Candidate(effect, "W1", ()).basis)
-    candidate = Candidate(effect, "W1", tuple(range(size)))
+    candidate, size = candidate_of(name)
     mixing = np.eye(size) - 0.3
     covariance = 1e-6 * mixing @ mixing.T
     for theta in rng.multivariate_normal(np.zeros(size), covariance, 50):
@@ -48,10 +52,8 @@ def test_the_error_of_a_whole_number_is_in_its_own_unit() -> None:
 @pytest.mark.parametrize(("name", "followed"), [("beam_coma", False), ("beam_ellipticity", True)])
 def test_no_slope_is_taken_along_an_amplitude_that_the_effect_cannot_follow(name: str, followed: bool) -> None:
     """The four amplitudes of a coma have two parameters: slopes along each would make a singular matrix."""
-    effect = systematics.get(name)
-    size = len(Candidate(effect, "W1", ()).basis)
-    candidate = Candidate(effect, "W1", tuple(range(size)))
-    theta = effect.parametrization.coordinates(effect(amplitude=0.02, angle_deg=20.0))
+    candidate, size = candidate_of(name)
+    theta = candidate.parametrization.coordinates(candidate.effect(amplitude=0.02, angle_deg=20.0))
     found = Fit(theta, 1e-6 * np.eye(size), 1000, 400.0, 1.0, 0.0, 1, 1.0)
     tables = [table for _, table in tables_beside([candidate], [0], found, np.full((1, size), 1e9), 0.3)]
     assert [table is not None for table in tables] == size * [followed]

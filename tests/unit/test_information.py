@@ -24,7 +24,7 @@ from mcsim.information.api import describe, widths
 from mcsim.information.result import Limits, canonical_correlations, marginalised
 from mcsim.simulation import simulate
 from mcsim.simulation.inverse_covariance import unit_skies
-from mcsim.simulation.survey import survey
+from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import healpix
 from mcsim.sphere.spectra import load
 from refusals import refused
@@ -96,12 +96,13 @@ def expected_log_likelihood(run: config.RunConfig, of: np.ndarray, at: tuple[np.
     return -np.sum(np.log(np.diag(factor[0]))) - 0.5 * np.trace(cho_solve(factor, spread))
 
 
+def quiet(run: config.RunConfig) -> Survey:
+    return survey(replace(run, channels=tuple(channel.without_noise() for channel in run.channels)))
+
+
 def moments_of(run: config.RunConfig) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance of the maps of a run, from a map of each unit sky."""
-    made = survey(run)
-    noise = np.concatenate([m.noise_uk for c in made.channels for m in c.maps])
-    quiet = tuple(replace(c, maps=tuple(replace(m, noise_uk=None) for m in c.maps)) for c in made.channels)
-    made = replace(made, channels=quiet)
+    noise, made = np.concatenate([m.noise_uk for m in survey(run).maps]), quiet(run)
     cl = load("wmap7", run.sky.lmax)
     skies = list(unit_skies(run.sky.lmax))
     mean = simulate.maps(made, 0, sky=0.0 * skies[0][1]).ravel()
@@ -253,10 +254,7 @@ def test_one_map_has_the_information_of_its_bipolar_coefficients() -> None:
         ]
         mean = []
         for end in ends:
-            made = survey(end)
-            quiet = tuple(replace(c, maps=tuple(replace(m, noise_uk=None) for m in c.maps)) for c in made.channels)
-            made = replace(made, channels=quiet)
-            found_here = 0.0
+            made, found_here = quiet(end), 0.0
             for ell, sky in unit_skies(lmax):
                 alm = healpix.analysis(simulate.maps(made, 0, sky=sky)[0], lmax, iterations=3)
                 found_here = found_here + cl[ell] * estimate(tables, alm, None)
