@@ -11,6 +11,8 @@ from scipy.optimize import minimize
 
 from mcsim.support.arrays import Vector
 
+POWER = 0.9  #: share of the cases of an S/N that are found where it counts as reached
+
 
 @dataclass(frozen=True)
 class Metric:
@@ -93,10 +95,8 @@ def _bootstrapped(name: str, statistic: Callable[..., Any], *samples: ArrayLike,
     return Metric(name, n, float(statistic(*arrays)), float(low), float(high))
 
 
-def snr_at_power(
-    name: str, strengths: Vector, found: NDArray[np.bool_], unit: float = 1.0, power: float = 0.9
-) -> Metric:
-    """Return the S/N, over ``unit``, at which effects are found with a power: probit regression on the S/N.
+def snr_at_power(name: str, strengths: Vector, found: NDArray[np.bool_], unit: float = 1.0) -> Metric:
+    """Return the S/N, over ``unit``, at which effects are found with POWER: probit regression on the S/N.
 
     With its bootstrap interval; NaN where there are fewer than 20 cases, or all or none are found.
     """
@@ -112,6 +112,6 @@ def snr_at_power(
             return -float(np.sum(special.log_ndtr(sign * (np.exp(parameters[1]) * (s - parameters[0])))))
 
         best = minimize(loss, np.array([np.median(s[hit == 0]) + 1.0, 0.0]), method="Nelder-Mead").x
-        return float(best[0] + special.ndtri(power) * np.exp(-best[1])) / unit
+        return float(best[0] + special.ndtri(POWER) * np.exp(-best[1])) / unit
 
     return _bootstrapped(name, solved, strengths, found, resampled=100)

@@ -12,6 +12,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+EVERY_S = 60.0  #: between lines of progress
+
 
 class Reporter:
     """Count of finished units of work, of which ``expect`` may announce more; this one shows nothing."""
@@ -34,8 +36,8 @@ class Reporter:
 
 
 @contextmanager
-def reporting(label: str, total: float, unit: str, quiet: bool = False, every_s: float = 60.0) -> Iterator[Reporter]:
-    """Yield a function that reports progress on standard error: a bar on a terminal, or a line every ``every_s``.
+def reporting(label: str, total: float, unit: str, quiet: bool = False) -> Iterator[Reporter]:
+    """Yield a function that reports progress on standard error: a bar on a terminal, or a line per minute.
 
     ``total`` is the number of units; 0 if :meth:`Reporter.expect` says later how many there are.
     """
@@ -53,7 +55,7 @@ def reporting(label: str, total: float, unit: str, quiet: bool = False, every_s:
         with Progress(*columns, console=console) as bar:
             yield _Bar(bar, label, total, unit)
     else:
-        lines = _Lines(console, label, total, unit, every_s)
+        lines = _Lines(console, label, total, unit)
         yield lines
         lines.close()
 
@@ -89,14 +91,14 @@ class _Bar(Reporter):
 
 
 class _Lines(Reporter):
-    def __init__(self, console: Console, label: str, total: float, unit: str, every_s: float) -> None:
+    def __init__(self, console: Console, label: str, total: float, unit: str) -> None:
         super().__init__(total, unit)
-        self.console, self.label, self.every_s, self.grows = console, label, every_s, total == 0.0
+        self.console, self.label, self.grows = console, label, total == 0.0
         self.last, self.state = self.start, (0.0, 0)
 
     def __call__(self, finished: float, failed: int = 0) -> None:
         now, self.state = time.monotonic(), (finished, failed)
-        if now - self.last >= self.every_s or (finished >= self.total and not self.grows):
+        if now - self.last >= EVERY_S or (finished >= self.total and not self.grows):
             self.last = now
             self._print(finished, failed)
 

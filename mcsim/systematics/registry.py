@@ -181,18 +181,13 @@ def _path_of(module: ModuleType) -> Path:
     return Path(str(getattr(module, "__file__", None))).absolute()  # what is built in has none
 
 
-def build(
-    kind: str | type[Effect],
-    parameters: Mapping[str, Any],
-    library: Library | None = None,
-    beside: tuple[str, ...] = (),
-) -> Effect:
+def build(kind: str | type[Effect], parameters: Mapping[str, Any], beside: tuple[str, ...] = ()) -> Effect:
     """Build an effect, or the one of that name, from a table of parameters; those left out have their defaults.
 
     ``beside``: keys that stand beside them in such a table. Raise InputError for an unknown name, a parameter that the
     effect does not have, or a value that is no finite number where one is needed.
     """
-    kind = get(kind, library) if isinstance(kind, str) else kind
+    kind = get(kind) if isinstance(kind, str) else kind
     known = [f.name for f in fields(kind)]
     values: dict[str, Any] = {}
     for key, value in parameters.items():

@@ -19,10 +19,10 @@ _TWO_PI = 2.0 * math.pi
 _TAN_PI_8 = math.sqrt(2.0) - 1.0
 
 
-def _arctangent_coefficients(degree: int = 11) -> NDArray[np.float64]:
+def _arctangent_coefficients() -> NDArray[np.float64]:
     """Return the polynomial in t^2 of (2/pi) arctan(t)/t for 0 <= t <= tan(pi/8), to rounding."""
     chebyshev = np.polynomial.Chebyshev.interpolate(
-        lambda v: np.arctan(np.sqrt(v)) / np.sqrt(v) * (2.0 / math.pi), degree, domain=[0.0, _TAN_PI_8**2]
+        lambda v: np.arctan(np.sqrt(v)) / np.sqrt(v) * (2.0 / math.pi), 11, domain=[0.0, _TAN_PI_8**2]
     )
     return np.asarray(chebyshev.convert(kind=np.polynomial.Polynomial).coef, dtype=np.float64)
 

@@ -123,12 +123,12 @@ def level_uk(scan: DifferencingScan, sigma0_uk: float) -> Map | None:
     return divided(sigma0_uk, np.sqrt(scan.hits_a + scan.hits_b))
 
 
-def rhs_of_map(scan: DifferencingScan, map_uk: Map, x: float = 0.0, nthreads: int = 1) -> Map:
+def rhs_of_map(scan: DifferencingScan, map_uk: Map, x: float = 0.0) -> Map:
     """Return the right-hand side, uK, shape (npix,), whose solution is a map: N m, without a pass over the samples."""
     check_imbalance(x)
     _check_map(scan, map_uk, "map")
-    with ThreadPoolExecutor(max(1, nthreads)) as pool:
-        return apply_normal(scan, x, map_uk, pool, nthreads)
+    with ThreadPoolExecutor(1) as pool:
+        return apply_normal(scan, x, map_uk, pool)
 
 
 def apply_normal(scan: DifferencingScan, x: float, map_uk: Map, pool: ThreadPoolExecutor, parts: int = 1) -> Map:
