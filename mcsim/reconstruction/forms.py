@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
+from mcsim.instrument.beams.coefficients import unpacked
 from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.reconstruction.sources import at, points
 from mcsim.sphere import alm as alm_
@@ -328,14 +329,12 @@ class Elsewhere(Form):
         """Add Y*_lm of the directions, as of a beam that points there."""
         top = min(self.top, beam.lmax)
         *vector, weight = np.array(self._there(site.channel)).T
-        lobe = points(np.array(vector), weight, top)
-        kernel = site.beam.blm[0, : top + 1].real * np.sqrt(4.0 * np.pi / (2.0 * np.arange(top + 1) + 1.0))
+        lobe = unpacked(points(np.array(vector), weight, top), top, top)
+        kernel = site.beam.window[: top + 1]
         kernel[: 0 if self.on_dipole else 2] = 0.0
         blm = np.zeros((max(beam.mmax, top) + 1, beam.lmax + 1), dtype=np.complex128)
         blm[: beam.mmax + 1] = beam.blm
-        for m in range(top + 1):
-            here = slice(alm_.start(top, m) + m, alm_.start(top, m) + top + 1)
-            blm[m, m : top + 1] += self.amplitude * self.factor * kernel[m:] * lobe[here]
+        blm[: top + 1, : top + 1] += self.amplitude * self.factor * kernel * lobe
         return replace(beam, blm=blm)
 
     def _there(self, channel: str) -> Towards:
