@@ -6,10 +6,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.support.arrays import Maps
 from mcsim.support.numbers import number
 
 Verdict = Literal["identical", "difference", "mixture", "degenerate", "unknown"]
-Maps = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

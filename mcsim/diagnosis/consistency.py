@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from mcsim.datavector.candidate import Candidate
@@ -14,11 +13,9 @@ from mcsim.datavector.slices import northern
 from mcsim.datavector.summaries import Element, bins, scales
 from mcsim.sphere.rotation import FRAMES
 from mcsim.stats.gaussian import SimulatedGaussian, Tolerated
-from mcsim.support.arrays import Matrix, Vector
+from mcsim.support.arrays import Matrix, Rows, Vector
 from mcsim.support.numbers import number, p_equals
 from mcsim.systematics import Effect, acts_through
-
-Rows = NDArray[np.int64]
 
 LARGE = 12  #: highest degree of the largest scales
 SPARE, SPARE_SHRUNK = 2.0, 1.25  #: simulations per element that a comparison needs; with a shrunk covariance

@@ -12,12 +12,12 @@ from scipy import special
 from mcsim.datavector.candidate import Candidate, beyond, columns_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.consistency import NOT_TESTED, Findings
-from mcsim.diagnosis.subsets import EXHAUSTIVE, Rows, Subsets, chunks
+from mcsim.diagnosis.subsets import EXHAUSTIVE, Subsets, chunks
 from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
 from mcsim.stats.scattered import variance_beside
-from mcsim.support.arrays import Matrix, Vector
+from mcsim.support.arrays import Matrix, Rows, Vector
 
 Verdict = Literal["none", "effect", "mixture", "degenerate", "unknown"]
 

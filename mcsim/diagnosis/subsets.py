@@ -6,7 +6,6 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from mcsim.datavector.candidate import Candidate
@@ -15,7 +14,7 @@ from mcsim.stats.detection import log_evidence
 from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, Tolerated, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
 from mcsim.stats.scattered import Beside
-from mcsim.support.arrays import Vector
+from mcsim.support.arrays import Rows, Vector
 
 # Relative to columns of norm one: keeps the normal equations of degenerate effects solvable, far below any noise.
 RIDGE = 1e-9
@@ -25,8 +24,6 @@ CHUNK = 1000
 
 EXHAUSTIVE = 2  #: largest number of members, beside those whose scatter is known, of which all subsets are tried
 KEPT = 300  #: larger subsets of one size that are tried, the most probable ones
-
-Rows = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

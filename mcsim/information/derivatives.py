@@ -15,10 +15,9 @@ from mcsim.simulation import convolve, simulate
 from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import dipole_alm
-from mcsim.support.arrays import Alm, Vector, divided
+from mcsim.support.arrays import Alm, Maps, Vector, divided
 from mcsim.systematics import Effect, acts_through, looked_at
 
-Maps = NDArray[np.float64]
 Orders = NDArray[np.complex128]  #: of a beam, shape (mmax + 1, lmax + 1)
 Observe = Callable[[Alm], Maps]  #: return the maps of all channels, shape (map, npix), of a sky
 DRAWS = 64  #: realizations that the mean of an effect of random shape is estimated from, in two halves

@@ -24,10 +24,8 @@ from numpy.typing import NDArray
 from mcsim.information.derivatives import Derivative
 from mcsim.simulation.inverse_covariance import InverseCovariance, product
 from mcsim.sphere import alm as alm_
-from mcsim.support.arrays import Alm, Cl, Matrix, divided
+from mcsim.support.arrays import Alm, Cl, Maps, Matrix, divided
 from mcsim.support.progress import Reporter
-
-Maps = NDArray[np.float64]
 
 PAIRED_BYTES = 1 << 30  #: memory for probes that are paired with each other; more probes are done in groups
 

@@ -26,9 +26,8 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng
 from mcsim.sphere.checks import check_cl
 from mcsim.sphere.sky import gaussian_alm
-from mcsim.support.arrays import Alm, Cl, Map, Vector, divided
+from mcsim.support.arrays import Alm, Cl, Map, Maps, Vector, divided
 
-Maps = NDArray[np.float64]  #: shape (map, npix), uK or uK^-1
 ITERATIONS = 2000  #: after so many the conjugate gradients are given up
 
 

@@ -1,6 +1,5 @@
 """From a configuration to what a realization needs: spectrum, beam responses, moments, weights, estimator tables."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -26,7 +25,7 @@ from mcsim.simulation.channels import (
     site_of,
     with_offsets,
 )
-from mcsim.simulation.filtering import Filtering
+from mcsim.simulation.filtering import Filtering, Progress
 from mcsim.simulation.noise import DrawnNoise, of_map
 from mcsim.simulation.pixel_means import Part, mean_gain, mean_signal
 from mcsim.simulation.preparation import Preparation, preparation
@@ -38,8 +37,6 @@ from mcsim.sphere.mask import read_mask
 from mcsim.support.arrays import divided
 from mcsim.support.loading import once_per_content
 from mcsim.systematics import Effect, Library, Site, seen_through, spread_of, variance_factor
-
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim.stats.excess import scatter_chi2
 from mcsim.stats.few_draws import scores_of_draws, without
 from mcsim.stats.gaussian import COLLINEAR, Fit, SimulatedGaussian, Tolerated, orthonormal
-from mcsim.support.arrays import Matrix, Vector, divided
+from mcsim.support.arrays import Matrix, Rows, Vector, divided
 
 STEEPEST = 1e3  #: condition number above which derivatives tell no errors
 
-Indices = NDArray[np.int64]
 Groups = Sequence[Sequence[int]]  #: columns of the templates of each candidate
 
 
@@ -103,7 +101,7 @@ class Beside:
                 excess[row, :known], error[row, :known] = one.excess, one.error
         return cls(size, chi2, spread, excess, error, np.ones(count) if variance is None else variance)
 
-    def tolerated(self, allowance: Vector, members: Indices, parts: Matrix, others: Indices) -> Tolerated:
+    def tolerated(self, allowance: Vector, members: Rows, parts: Matrix, others: Rows) -> Tolerated:
         """Return what tests of candidates ``others``, shape (M or 1, N), beside M sets tolerate, shape (M, N) each.
 
         ``allowance``, shape (M,), is that of :class:`~mcsim.stats.gaussian.Tolerated`, ``members`` are the sets, and

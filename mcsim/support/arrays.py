@@ -11,8 +11,10 @@ from mcsim.errors import InputError
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float64]
+Maps = NDArray[np.float64]
 Cl = NDArray[np.float64]
 Alm = NDArray[np.complex128]
+Rows = NDArray[np.int64]
 
 COUNTED = ("l", "ell", "multipole", "m", "pixel", "pix", "ipix")
 """Names of labels, of xarray and pandas, that say an element's place."""
