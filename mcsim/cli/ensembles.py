@@ -21,7 +21,9 @@ def run(
     realizations: Part = None,
     workers: Processes = None,
     scheduler: Scheduler = None,
-    dry_run: Annotated[bool, Option("--dry-run", help="Say memory, disk, files and time; compute nothing.")] = False,
+    dry_run: Annotated[
+        bool, Option("--dry-run", help="Say what is left, memory, disk, files, time; compute nothing.")
+    ] = False,
 ) -> None:
     """Run an ensemble; continue it if it was interrupted; extend it if more realizations are asked for.
 
@@ -35,7 +37,7 @@ def run(
     if dry_run:
         from mcsim.ensemble import plan
 
-        print(plan.describe(config, part, workers))
+        print(plan.describe(config, part, workers, store, resume))
         return
     runner = loaded("mcsim.ensemble.runner")
     _report(runner.run(config, store, resume=resume, realizations=part, workers=where, quiet=False))

@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,9 @@ import numpy as np
 from mcsim import config
 from mcsim.bipolar import Mode, estimate, estimator, modes
 from mcsim.bipolar.modes import CONVENTION, NORMALISATION
-from mcsim.ensemble import store
-from mcsim.ensemble.layout import Layout
-from mcsim.errors import InputError
+from mcsim.ensemble import repair, store
+from mcsim.ensemble.layout import Layout, listed
+from mcsim.errors import InputError, RunError
 from mcsim.instrument.scan import read_moments
 from mcsim.instrument.scan.accumulate import SECONDS_PER_SAMPLE
 from mcsim.simulation import differencing, noise, offsets, power, skies
@@ -29,6 +30,7 @@ from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.mask import read_mask
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.support.code import version
+from mcsim.support.folders import real_path, user_path
 from mcsim.support.numbers import duration
 from mcsim.support.progress import reporting
 
@@ -82,6 +84,31 @@ def exists(path: Path) -> bool:
         raise InputError(
             f"{str(path)[:60]}... cannot be a store ({error.strerror}); give a shorter path with -o."
         ) from error
+
+
+def target(run: config.RunConfig, part: slice | None, path: str | Path | None) -> Path:
+    """Return the store of a run; of one behind a link, lock, log and scratch files belong beside the store itself."""
+    return real_path(user_path(path) if path is not None else default_store(run, part))
+
+
+def check_store(path: Path, run: config.RunConfig, resume: bool) -> bool:
+    """Return True if a run goes on with a store at ``path``, False if it starts one; InputError if it can do neither.
+
+    ``resume``: a store is required, and its attributes may be lost.
+    """
+    if not exists(path):
+        if resume:
+            raise InputError(f"There is no store {path} to resume; leave out --resume to start it.")
+        return False
+    (check_summarised if resume and store.headless(path) else check_same)(path, run)
+    return True
+
+
+def finished(path: Path, run: config.RunConfig, realizations: range) -> bool:
+    """Return True if a store of this configuration has all these realizations and their summary."""
+    done, (count, bins) = store.done(path), store.summarised(path)
+    binned = bins == list(range(0, config.analysis_lmax(run) + 1, run.biposh.summary_bin))
+    return realizations.stop <= len(done) and bool(done[realizations].all()) and count == done.sum() and binned
 
 
 def layout(survey: Survey) -> Layout:
@@ -189,26 +216,76 @@ class Cost:
         ]
 
 
-def describe(source: str | Path, part: slice | None = None, workers: int | None = None) -> str:
-    """Return a text on the cost of a run: realizations, tasks, memory, disk, files and time."""
+def describe(
+    source: str | Path,
+    part: slice | None = None,
+    workers: int | None = None,
+    path: str | Path | None = None,
+    resume: bool = False,
+) -> str:
+    """Return a text on the cost of a run: realizations, tasks, memory, disk, files and time.
+
+    Of a store that is there, at ``path`` or where the run would make it, what it holds is said, and the cost of the
+    rest; with ``resume`` each of its files is read first. What the run would refuse is refused.
+    """
     run = config.load(source)
     refuse_external(run)
+    realizations = wanted(run, part)
+    place = target(run, part, path)
+    there = check_store(place, run, resume)
+    if path is not None:
+        store.check_writable(place)
+    config.check_skies(run, realizations)
     check_beams(run)
     check_scans(run)
     check_effects(run)
     _check_files(run)
     _check_preparation(run)
-    number, found = len(wanted(run, part)), with_scans(cost(run), run)
-    memory, *rest = found.lines(number, workers or run.compute.workers)
-    disk = float(found.layout.realization_bytes()) * number
+    found = with_scans(cost(run), run)
+    missing, held, chunk = list(realizations), list[str](), found.layout.chunk
+    if there:
+        missing, held = _missing(place, run, realizations, resume)
+        with suppress(RunError):  # of one whose parts are made anew
+            chunk = store.chunk(place)
+    tasks = len({r // chunk for r in missing})
+    first = f"{run.name}: {len(missing)} realizations in {tasks} tasks"
+    if not missing:
+        return "\n".join([first, *held])
+    memory, *rest = found.lines(len(missing), workers or run.compute.workers)
+    disk = float(found.layout.realization_bytes()) * len(missing)
     return "\n".join(
         [
-            f"{run.name}: {number} realizations in {-(-number // found.layout.chunk)} tasks",
+            first,
+            *held,
             memory,
             f"  disk    {disk / 1e6:.1f} MB in about {found.layout.files()} files",
             *rest,
         ]
     )
+
+
+def _missing(path: Path, run: config.RunConfig, realizations: range, resume: bool) -> tuple[list[int], list[str]]:
+    """Return the realizations that a run on a store there would compute, and lines on what the store holds."""
+    if store.headless(path):
+        words = "has lost its attributes; they are made again first, and what else is damaged is not known before"
+        return list(realizations), [f"  store   {path} {words}"]
+    verdict = repair.verify(path) if resume else None
+    lines = [] if verdict is None else [f"  damaged {name}, made again ({why})" for name, why in verdict.broken.items()]
+    if verdict is not None and "done" in verdict.broken:
+        words = "does not say which realizations it holds; that is repaired first, and fewer may have to be computed"
+        return list(realizations), [f"  store   {path} {words}", *lines]
+    done, lost = store.done(path), () if verdict is None else verdict.lost
+    if lost:
+        lines.insert(0, f"  damaged {listed(lost)}, computed again")
+    missing = [r for r in realizations if r >= len(done) or not done[r] or r in lost]
+    words = f"{path} holds {len(realizations) - len(missing)} of {len(realizations)}"
+    if finished(path, run, realizations):
+        if verdict is None:
+            store.check_whole(path)
+        words += "" if lines else ", and their summary: nothing is left to do"
+    elif not missing:
+        words += "; their summary is made anew"
+    return missing, [f"  store   {words}", *lines]
 
 
 def _check_files(run: config.RunConfig) -> None:

@@ -168,6 +168,41 @@ def test_dry_run_says_the_cost_and_computes_nothing(mcsim: Command, tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
+def test_dry_run_says_what_a_store_holds_and_what_is_left(mcsim: Command, copy: Path, tmp_path: Path) -> None:
+    """Ten realizations in chunks of four, of which those of the second chunk are not finished, then one is damaged."""
+    (tmp_path / "small.toml").write_text(SMALL)
+    dry = ("run", "small.toml", "--dry-run")
+    assert mcsim(*dry)[1].startswith("small: 10 realizations in 10 tasks\n")
+    assert_refused(mcsim(*dry, "--resume"), "small.zarr", "--resume")
+    assert_refused(mcsim("run", "tiny", "--dry-run", "-o", copy), copy, "sky.lmax", "48", "-o")
+    code, out, _ = mcsim(*dry, "-o", copy)
+    assert (code, out.splitlines()[0]) == (0, "small: 0 realizations in 0 tasks")
+    assert len(out.splitlines()) == 2
+    assert f"{copy} holds 10 of 10" in out
+    (copy / "done" / "c" / "1").unlink()
+    before = stamps(copy)
+    [first, held, *rest] = mcsim(*dry, "-o", copy)[1].splitlines()
+    assert first == "small: 4 realizations in 1 tasks"
+    assert held == f"  store   {copy} holds 6 of 10"
+    assert any("memory" in line for line in rest)
+    assert mcsim(*dry, "-o", copy, "--realizations", "2:6")[1].startswith("small: 2 realizations in 1 tasks\n")
+    damaged = next(file for file in (copy / "biposh" / "c" / "0").rglob("*") if file.is_file())
+    damaged.write_bytes(b"x")
+    [first, held, damage, *_] = mcsim(*dry, "-o", copy, "--resume")[1].splitlines()
+    assert first == "small: 8 realizations in 2 tasks"
+    assert held == f"  store   {copy} holds 2 of 10"
+    assert damage == "  damaged realizations 0-3, computed again"
+    (copy / "done" / "zarr.json").rename(tmp_path / "done.json")
+    assert mcsim(*dry, "-o", copy, "--resume")[1].startswith("small: 10 realizations in 10 tasks\n")
+    (tmp_path / "done.json").rename(copy / "done" / "zarr.json")
+    (copy / "zarr.json").write_text("{}")
+    assert mcsim(*dry, "-o", copy, "--resume")[1].startswith("small: 10 realizations in")
+    assert {file for file, when in stamps(copy).items() if before[file] != when} == {
+        damaged.relative_to(copy),
+        Path("zarr.json"),
+    }
+
+
 def test_finished_store_says_so(mcsim: Command, small_store: Path, tmp_path: Path) -> None:
     (tmp_path / "small.json").write_text(json.dumps(table()))
     toml = tmp_path / "small.toml"

@@ -15,13 +15,12 @@ from mcsim.ensemble.layout import Layout, listed
 from mcsim.ensemble.lock import locked
 from mcsim.ensemble.runner.cluster import LOST, Roll, Workers, answers, check_workers, connected, death
 from mcsim.ensemble.tasks import Failure, Job, packages, realize_chunk, summarise_node
-from mcsim.errors import InputError, RunError
+from mcsim.errors import RunError
 from mcsim.simulation import power, simulate
 from mcsim.simulation.channels import check_effects
 from mcsim.simulation.survey import Survey, survey
 from mcsim.stats import streaming
 from mcsim.stats.streaming import Sums
-from mcsim.support.folders import real_path, user_path
 from mcsim.support.progress import Journal, reporting
 
 
@@ -95,16 +94,11 @@ def run(
         check_workers(workers)
     loaded = config.load(source)
     wanted = plan.wanted(loaded, realizations)
-    # Of a store behind a link, lock, log and scratch files belong beside the store itself.
-    target = real_path(user_path(path) if path is not None else plan.default_store(loaded, realizations))
-    exists = plan.exists(target)
-    if resume and not exists:
-        raise InputError(f"There is no store {target} to resume; leave out --resume to start it.")
-    if exists and not resume and _finished(target, loaded, wanted):
+    target = plan.target(loaded, realizations, path)
+    exists = plan.check_store(target, loaded, resume)
+    if exists and not resume and plan.finished(target, loaded, wanted):
         store.check_whole(target)
         return Result(target, int(store.done(target).sum()), 0, ())
-    if exists:
-        (plan.check_summarised if resume and store.headless(target) else plan.check_same)(target, loaded)
     store.check_writable(target)
     config.check_skies(loaded, wanted)
     check_effects(loaded)
@@ -124,19 +118,11 @@ def run(
         stack.enter_context(_written_down(journal, loaded, wanted))
         if resume:
             _mend(target, shared, journal, quiet)
-            if _finished(target, loaded, wanted):
+            if plan.finished(target, loaded, wanted):
                 return Result(target, int(store.done(target).sum()), 0, ())
         if client is None:
             client = stack.enter_context(connected(workers or loaded.compute.workers))
         return _run(client, shared, target, wanted, journal)
-
-
-def _finished(target: Path, run: config.RunConfig, wanted: range) -> bool:
-    """Return True if a store of this configuration has all wanted realizations and their summary."""
-    plan.check_same(target, run)
-    done, (count, bins) = store.done(target), store.summarised(target)
-    binned = bins == list(range(0, config.analysis_lmax(run) + 1, run.biposh.summary_bin))
-    return wanted.stop <= len(done) and bool(done[wanted].all()) and count == done.sum() and binned
 
 
 @contextmanager
