@@ -11,7 +11,7 @@ from typer import Argument, Exit, Option
 from typer.core import TyperCommand, TyperGroup
 
 from mcsim.errors import InputError
-from mcsim.support.folders import unwritable, user_path
+from mcsim.support.folders import outside_stores, unwritable, user_path
 
 
 def _without_types(options: list[Any]) -> list[Any]:
@@ -118,6 +118,7 @@ def picture(asked: Path | None, shown: str | Path, end: str = "") -> Path:
     source = user_path(shown)
     folder = source.absolute().parent if source.name in ("", "..") else source.parent
     target = folder / f"{source.absolute().stem}{end}.png" if asked is None else user_path(asked)
+    outside_stores(target)
     with unwritable(target, "choose another file with -o"), TemporaryFile(dir=target.absolute().parent):
         pass
     return target

@@ -25,7 +25,7 @@ from zarr.storage import MemoryStore
 
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.errors import InputError, RunError
-from mcsim.support.folders import is_full, unwritable
+from mcsim.support.folders import is_full, outside_stores, unwritable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -55,7 +55,12 @@ class Damage:
 
 
 def check_writable(path: Path) -> Path:
-    """Check that a store can be made, without making anything; return the innermost existing folder."""
+    """Check that a store can be made, without making anything; return the innermost existing folder.
+
+    A new store within another one is refused.
+    """
+    if not path.exists():
+        outside_stores(path)
     folder = path.absolute().parent
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent

@@ -61,6 +61,18 @@ def not_a_file(path: Path) -> None:
             return
 
 
+def outside_stores(path: Path, filled: bool = False) -> None:
+    """Raise InputError for a path within a Zarr store, which would no longer be what it was.
+
+    ``filled``: for a folder that is filled, and so may not be a store itself.
+    """
+    real = Path(os.path.realpath(path))
+    for one in (real, *real.parents) if filled else real.parents:
+        if (one / "zarr.json").is_file():
+            where = "is a store" if one == real else f"is within the store {one}"
+            raise InputError(f"{path} {where}, and nothing is written into one; choose a place outside it.")
+
+
 def is_full(error: BaseException | None) -> bool:
     """Return True for an error of a disk, or a quota, that is full: the input is not to blame."""
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
@@ -124,7 +136,11 @@ def _written_beside(path: Path, text: str) -> Iterator[Path]:
 
 
 def writable(folder: Path) -> None:
-    """Raise InputError if a folder cannot be made or written into; a folder that is made for the test is removed."""
+    """Raise InputError if a folder cannot be made or written into; a folder that is made for the test is removed.
+
+    A folder that is a Zarr store, or within one, is refused as well.
+    """
+    outside_stores(folder, filled=True)
     with unwritable(folder, "choose another folder"):
         made = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)

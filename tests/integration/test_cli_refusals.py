@@ -203,3 +203,30 @@ def test_a_challenge_refuses_wrong_options(mcsim: Command, tmp_path: Path, words
     assert code == 2
     assert named in error
     assert not list((tmp_path / "made").rglob("*.json"))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("merge", "copy.zarr", "-o", "copy.zarr/sub"),
+        ("merge", "copy.zarr", "-o", "copy.zarr/deep/sub"),
+        ("run", "small.toml", "-o", "copy.zarr/sub"),
+        ("run", "small.toml", "--dry-run", "-o", "copy.zarr/sub"),
+        ("info", "copy.zarr", "--export", "copy.zarr/sub.zarr"),
+        ("info", "copy.zarr", "--export", "copy.zarr/sub.ecsv"),
+        ("plot", "copy.zarr", "-o", "copy.zarr/sub.png"),
+        ("predict", "small.toml", "-o", "link/sub.nc"),
+        ("maps", "small.toml", "-o", "copy.zarr/sub"),
+        ("maps", "small.toml", "--realization", "0", "-o", "copy.zarr/sub"),
+        ("diagnose", "small.toml", "maps", "-o", "copy.zarr"),
+    ],
+)
+def test_nothing_is_written_into_a_store(words: tuple[str, ...], mcsim: Command, copy: Path, tmp_path: Path) -> None:
+    (tmp_path / "small.toml").write_text(SMALL)
+    (tmp_path / "link").symlink_to(copy)
+    if words[0] == "diagnose":
+        assert mcsim("maps", "small.toml", "--realization", "0", "-o", "maps")[0] == 0
+    before = sorted(copy.rglob("*"))
+    named = {"link/sub.nc": tmp_path / "link", "copy.zarr": "copy.zarr"}
+    assert_refused(mcsim(*words), named.get(words[-1], copy))
+    assert sorted(copy.rglob("*")) == before

@@ -38,7 +38,7 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     Raises
     ------
     InputError
-        If the stores are not of one configuration, or ``path`` exists.
+        If the stores are not of one configuration, or ``path`` exists or is within a store.
     RunError
         If the disk is full; nothing of the new store is left.
 
