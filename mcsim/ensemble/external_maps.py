@@ -193,7 +193,7 @@ class StoredMaps(Source):
 
 def fits_maps(parts: tuple[Part, ...], template: str) -> FitsMaps:
     """Find the realizations of a template."""
-    found = FitsMaps(parts, Path(template).name, template=os.path.abspath(template))
+    found = FitsMaps(parts, _label(template), template=os.path.abspath(template))
     first = parts[0]
     pattern, expression = "", ""
     try:
@@ -221,6 +221,13 @@ def fits_maps(parts: tuple[Part, ...], template: str) -> FitsMaps:
             if not os.path.isfile(found._path(part, r)):
                 raise InputError(f"{found._path(part, r)} does not exist, the map {part.name} of realization {r}.")
     return FitsMaps(parts, found.label, template=found.template, realizations=tuple(numbers))
+
+
+def _label(template: str) -> str:
+    """Return the end of a template that says which maps these are: its first field, and the folder that has it."""
+    places = Path(template).parts
+    first = next(place for place, part in enumerate(places) if "{" in part)
+    return str(Path(*places[max(first - 1, 0) :])) if first < len(places) - 1 else places[first]
 
 
 @once_per_content(1)

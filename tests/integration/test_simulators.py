@@ -199,3 +199,22 @@ def test_a_dry_run_refuses_the_counts_that_a_diagnosis_refuses():
             api.describe(model, settings)
         with refused(*words):
             mcsim.diagnose(model, list(native(5, 1)[0]), settings=settings)
+
+
+@pytest.mark.parametrize(
+    ("template", "shown"),
+    [
+        ("many/{realization:05d}/{channel}_{split}.fits", "many/{realization:05d}/{channel}_{split}.fits"),
+        ("many/{split}/{realization}.fits", "many/{split}/{realization}.fits"),
+        ("many/{channel}_{split}_{realization}.fits", "{channel}_{split}_{realization}.fits"),
+    ],
+)
+def test_stored_maps_are_called_by_what_tells_them_apart(template, shown, tmp_path):
+    run = config.load(MODEL)
+    for part in parts_of(run):
+        path = tmp_path / template.format(realization=3, channel=part.channel, split=part.split)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    found = source_of(run, str(tmp_path / template))
+    assert found.label == shown
+    assert found.words(0, 0) == f"realization 3 of {shown}"
