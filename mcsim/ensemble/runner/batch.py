@@ -5,12 +5,13 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from distributed import Client, KilledWorker
 
 from mcsim import config
 from mcsim.ensemble import plan, repair, store, summary
+from mcsim.ensemble.few_probes import warn_of_probes
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.ensemble.lock import locked
 from mcsim.ensemble.runner.cluster import LOST, Roll, Workers, answers, check_workers, connected, death
@@ -22,6 +23,9 @@ from mcsim.simulation.survey import Survey, survey
 from mcsim.stats import streaming
 from mcsim.stats.streaming import Sums
 from mcsim.support.progress import Journal, reporting
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 @dataclass(frozen=True)
@@ -164,7 +168,9 @@ def _run(client: Client, shared: Survey, target: Path, wanted: range, journal: J
     try:
         roll = Roll(client, journal)
         failures = _simulate(roll, target, run, wanted, journal)
-        _summarise(roll, target, layout, journal.quiet)
+        made = _summarise(roll, target, layout, journal.quiet)
+        if made is not None and shared.filtering is not None:
+            warn_of_probes(shared.filtering, made)
     except (KilledWorker, *LOST) as error:
         lost = "The connection to the scheduler is lost"
         reason = f"The summary cannot be made, for {death(error)}" if isinstance(error, KilledWorker) else lost
@@ -222,7 +228,8 @@ def _outcomes(
                 yield outcome if killed is None else (0, [Failure(r, death(killed))])
 
 
-def _summarise(roll: Roll, target: Path, layout: Layout, quiet: bool) -> None:
+def _summarise(roll: Roll, target: Path, layout: Layout, quiet: bool) -> "xr.Dataset | None":
+    """Write the summary, and return it; None if no realization is finished."""
     size, node = layout.realizations, layout.chunk
     while node * 16 < size:
         node *= 2
@@ -240,5 +247,8 @@ def _summarise(roll: Roll, target: Path, layout: Layout, quiet: bool) -> None:
             return arrived.pop(index)
 
         total = streaming.tree(result, len(calls))
-    if total is not None:
-        store.write_summary(target, summary.dataset(layout, total, store.attributes(target)))
+    if total is None:
+        return None
+    made = summary.dataset(layout, total, store.attributes(target))
+    store.write_summary(target, made)
+    return made
