@@ -235,14 +235,15 @@ class DisturbedSurvey:
             beam = seen_through(acting, site)
             beam = beam.truncated(min(beam.mmax, *(m.moments.smax for m in channel.maps)))
             response = convolve.response(beam, site.lmax, channel.window ** (spread_of(acting) ** 2))
+        moved = spread_of(acting) != 1.0  # signals of a direction are then not linear in coordinates
         bent = tuple(effect for one, effect in drawn if one.parameter_widths and one.channel in (None, channel.name))
         maps = []
         for place, m in enumerate(channel.maps):
             part = Part.of(self.survey.config, place)
             gains = [self._own_gains[channel.name][place], mean_gain(bent, site, part, self._orders(channel))]
-            signals = [m.signal_uk, mean_signal(bent, site, part)]
+            signals = [mean_signal(acting, site, part)] if moved else [m.signal_uk, mean_signal(bent, site, part)]
             for (number, name, key), basis in self._means.items():
-                if name == channel.name:
+                if name == channel.name and not (moved and key == "signal"):
                     coordinates = drawn[number][1].parametrization.coordinates(drawn[number][1])
                     (gains if key == "gain" else signals).append(np.tensordot(coordinates, basis[place], 1))
             own = with_effects(m, more, site)

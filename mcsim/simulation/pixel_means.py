@@ -19,7 +19,7 @@ from mcsim.support import folders
 from mcsim.support.arrays import Map, divided
 from mcsim.support.code import class_digest, package_digest
 from mcsim.support.compiled import njit
-from mcsim.systematics import Effect, Pointing, Site, adding
+from mcsim.systematics import Effect, Pointing, Site, adding, spread_of
 
 _TIMES = 4096  #: at which a gain or a signal is evaluated for the key
 
@@ -64,12 +64,16 @@ def mean_gain(acting: tuple[Effect, ...], site: Site, part: Part, orders: int = 
 
 
 def mean_signal(acting: tuple[Effect, ...], site: Site, part: Part) -> Map | None:
-    """Return the mean of what effects add to the samples of every pixel, uK, by a pass like that of the gain."""
-    found = adding(acting)
+    """Return the mean of what effects add to the samples of every pixel, uK, by a pass like that of the gain.
+
+    Where an effect shrinks the samples' offsets from the pixels' centres, what is added is that of where they are then.
+    """
+    found, spread = adding(acting), spread_of(acting)
     if not found:
         return None
 
     def add(chunk: tod.Samples, sums: NDArray[np.float64]) -> None:
+        chunk = tod.shrunk(chunk, site.nside, spread)
         terms = (effect.signal(chunk.time_s, chunk.theta, chunk.phi, chunk.psi, site) for effect in found)
         _add(chunk.pixel, sum(terms, start=chunk.signal_uk), sums)
 

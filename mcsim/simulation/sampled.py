@@ -130,18 +130,7 @@ def _true(channel: Channel, grid: MapGrid, delay_s: float) -> Iterator[tod.Sampl
 
 def _spread(channel: Channel, chunk: tod.Samples, reference: tod.Samples) -> tod.Samples:
     """Move samples as an effect on their spread moves the reference towards the centres of its pixels."""
-    spread = systematics.spread_of(channel.effects)
-    if spread == 1.0:
-        return chunk
-    centres = np.stack(healpy.pix2vec(channel.site.nside, reference.pixel))
-    step = (spread - 1.0) * (_vector(reference) - centres)
-    x, y, z = _vector(chunk) + step
-    return replace(chunk, theta=np.arctan2(np.hypot(x, y), z), phi=np.arctan2(y, x) % (2.0 * np.pi))
-
-
-def _vector(chunk: tod.Samples) -> Map:
-    sine = np.sin(chunk.theta)
-    return np.stack([sine * np.cos(chunk.phi), sine * np.sin(chunk.phi), np.cos(chunk.theta)])
+    return tod.shrunk(chunk, channel.site.nside, systematics.spread_of(channel.effects), reference)
 
 
 def _gained(channel: Channel) -> tod.Stage:

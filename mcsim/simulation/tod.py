@@ -91,6 +91,24 @@ def samples(
         yield from (one.result() for one in made)
 
 
+def shrunk(chunk: Samples, nside: int, spread: float, reference: Samples | None = None) -> Samples:
+    """Return samples whose offsets from the centres of their pixels are ``spread`` times as large, psi kept.
+
+    ``reference``: samples with the offsets that shrink, where those of ``chunk`` itself were moved; by default its own.
+    """
+    if spread == 1.0:
+        return chunk
+    own = _vector(chunk)
+    there = own if reference is None else _vector(reference)
+    x, y, z = own + (spread - 1.0) * (there - np.stack(healpy.pix2vec(nside, (reference or chunk).pixel)))
+    return replace(chunk, theta=np.arctan2(np.hypot(x, y), z), phi=np.arctan2(y, x) % (2.0 * np.pi))
+
+
+def _vector(chunk: Samples) -> Map:
+    sine = np.sin(chunk.theta)
+    return np.stack([sine * np.cos(chunk.phi), sine * np.sin(chunk.phi), np.cos(chunk.theta)])
+
+
 def with_signal(signal: Callable[[Samples], Map]) -> Stage:
     """Return a stage that gives every chunk the signal that a function returns for it, uK, shape (n,)."""
 

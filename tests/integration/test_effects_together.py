@@ -131,3 +131,16 @@ def test_rings_have_errors_and_signals_of_their_own(effect):
         default, reference = responses((effect,), (CENTRED,), index, splits=["a", "b"], split_by="rings")
         assert np.std(reference) > 5.0
         assert np.abs(default - reference).max() < 1e-4
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+@pytest.mark.parametrize(
+    "added", [{"name": "orbital_dipole", "amplitude": 1.0}, {"name": "sidelobe_pickup", "amplitude": 0.05}]
+)
+def test_signals_of_a_direction_are_those_of_where_samples_are(added, share):
+    """Samples nearer to the pixels' centres see the Earth's motion, and what a lobe sees, from there: up to 0.9 uK."""
+    nearer = {"name": "pixelization", "amplitude": share}
+    default, reference = responses((added,), beside=(nearer,))
+    elsewhere, _ = responses((added,))
+    assert np.abs(default - reference).max() < 1e-5
+    assert np.abs(default - elsewhere).max() > 0.05

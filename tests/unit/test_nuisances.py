@@ -104,6 +104,23 @@ def test_a_signal_follows_the_parameters_that_are_drawn_with_it():
             np.testing.assert_allclose(one.signal_uk, other.signal_uk, atol=1e-9)
 
 
+def test_a_signal_is_that_of_where_drawn_offsets_leave_the_samples():
+    added = {"effect": "orbital_dipole", "channel": "V1", "width": [0.5, 0.5]}
+    run = model(added, {"effect": "pixelization", "channel": "V1", "width": 0.5})
+    own = {"name": "orbital_dipole", "channel": "V1", "amplitude": 0.2}
+    run = config.load(config.to_dict(run) | {"effect": [own]})
+    found = DisturbedSurvey.of(run).at(0).channels
+    for one, other in zip(found, survey(replace(run, effects=_with_drawn(run))).channels, strict=True):
+        for m, expected in zip(one.maps, other.maps, strict=True):
+            assert (m.signal_uk is None) == (expected.signal_uk is None)
+            if m.signal_uk is not None:
+                np.testing.assert_allclose(m.signal_uk, expected.signal_uk, atol=1e-9)
+
+
+def _with_drawn(run):
+    return (*run.effects, *tables(run, run.ensemble.seed, 0))
+
+
 def test_a_calibration_multiplies_sky_and_dipole_in_all_pixels():
     run = model()
     off = replace(run, effects=(config.Effect(name="calibration", channel="W1", parameters={"amplitude": 0.01}),))
