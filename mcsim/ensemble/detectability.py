@@ -16,8 +16,10 @@ from mcsim.bipolar.theory import (
     signal_to_noise,
 )
 from mcsim.ensemble import plan, summary
-from mcsim.ensemble.expectation import L_WEIGHTS, Means
+from mcsim.ensemble.expectation import L_WEIGHTS, Means, spectrum
 from mcsim.simulation.survey import Survey
+from mcsim.support.arrays import divided
+from mcsim.systematics import spread_of
 
 MONOPOLE = Mode(0, 0, 0)
 
@@ -53,6 +55,21 @@ def _overlap(survey: Survey, pair: tuple[int, int], reach: int) -> Overlap:
     npix = next(weight.size for weight in weights if weight is not None)
     x, y = (np.ones(npix) if weight is None else weight for weight in weights)
     return overlap(x, y, reach, L_WEIGHTS[-1])
+
+
+def scattered(survey: Survey, found: dict[tuple[int, int], Means], number: int) -> NDArray[np.float64]:
+    """Return the share of the mean spectrum of a map (index) that its weights scatter into each degree, (lmax + 1,).
+
+    It is what the spectrum has above that of the full sky; negative where weights take more away than they bring.
+    """
+    channel = next(one for one in survey.channels if survey.maps[number] in one.maps)
+    degrees = np.arange(survey.lmax + 1)
+    window = channel.window[: survey.lmax + 1] ** (spread_of(channel.effects) ** 2 - 1.0)
+    beam = np.sqrt(4.0 * np.pi / (2.0 * degrees + 1.0)) * channel.beam.blm[0, : survey.lmax + 1].real * window
+    own = found[number, number]
+    monopole = survey.estimator.modes.index(MONOPOLE)
+    there = cl_of(survey, own.circular[monopole])
+    return divided(there - spectrum(survey)[: survey.lmax + 1] * beam**2, there + cl_of(survey, own.noise[monopole]))
 
 
 def variances_of(
