@@ -147,7 +147,8 @@ class Effect:
         False: a diagnosis proposes it only where it is asked for by name (``mcsim diagnose --with NAME``), or where it
         explains the data in the place of an effect that is about to be named.
     rank
-        Effects on the shape of a beam act by rank: -1 completes the fiducial beam, 1 adds what no other one changes.
+        Effects on the shape of a beam act by rank: -2 completes the fiducial beam, -1 stretches it, 1 adds what no
+        other one changes.
 
     Examples
     --------

@@ -51,6 +51,10 @@ class BeamEllipticity(Effect):
         Ratio of the axes less one, of a beam that was round.
     angle_deg
         Direction of the major axis, from beam x (along the scan) towards y.
+
+    Notes
+    -----
+    It acts before other effects on the shape, wherever it is listed: a coma is in sigmas of the stretched beam.
     """
 
     name = "beam_ellipticity"
@@ -70,6 +74,7 @@ class BeamEllipticity(Effect):
         ),
     )
     parametrization = Angle(multiple=2)
+    rank = -1
 
     angle_deg: float = 0.0
 
@@ -110,7 +115,7 @@ class BeamNoncircularity(Effect):
     source = "Joshi et al. arXiv:1210.7318, Sec. IV"
     step = 0.05
     bounds = (Bound("amplitude", -2.0, 2.0, "1 is the beam as measured; a prior of this library: at most twice that"),)
-    rank = -1
+    rank = -2
 
     def beam(self, beam: Beam, site: Site) -> Beam:
         whole, kept = site.whole_beam(self.name), site.beam.mmax + 1
@@ -176,7 +181,8 @@ class BeamComa(Effect):
     -----
     u^3 - 3u is the third Hermite polynomial: it moves neither the centroid of a Gaussian nor its width. Sigma is that
     of the Gaussian with the beam's solid angle. Beyond 7 sigma the change fades out, to nothing at 9: there is no beam
-    there to lean, but a little noise of its coefficients that the cube would amplify. The change is
+    there to lean, but a little noise of its coefficients that the cube would amplify. It acts after an ellipticity,
+    which would stretch u as well. The change is
     k sigma^-3 times c1 cos a + s1 sin a + c3 cos 3a + s3 sin 3a in the angle a, whatever the beam: m = 1 goes with the
     angle and m = 3 with three times it, so that four components span it.
     """

@@ -65,6 +65,18 @@ def test_the_sky_changes_before_a_channel_does(own):
         np.testing.assert_array_equal(systematics.looked_at(acting, sky, site, 1, 0), expected)
 
 
+def test_a_coma_is_of_the_stretched_beam():
+    """A stretch of 16 % after it would change its m = 1 part by 18 %; a width as much before it as after."""
+    site = site_of(Beam.gaussian(FWHM, LMAX))
+    stretch, coma = effect("beam_ellipticity", 0.16, angle_deg=20.0), effect("beam_coma", 0.02, angle_deg=20.0)
+    expected = coma.beam(stretch.beam(site.beam, site), site).blm
+    for acting in permutations([coma, stretch]):
+        np.testing.assert_array_equal(systematics.seen_through(acting, site).blm, expected)
+    wide = effect("beam_width", 0.1)
+    one, other = (systematics.seen_through(acting, site).blm for acting in permutations([coma, wide]))
+    assert np.abs(one - other).max() < 1e-4 * np.abs(one[1:]).max()
+
+
 @pytest.mark.parametrize("calibrated", ["none", "dipole"])
 def test_no_coma_amplifies_a_sidelobe(calibrated):
     """(u^3 - 3u) of a ring at five sigmas is a hundred: its integral would grow by as much."""
