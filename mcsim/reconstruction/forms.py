@@ -216,14 +216,16 @@ class InTime(Form):
     #: of cosine and sine, of this and of each further harmonic, or of the pattern, or of components, or the constant
     coefficients: ClassVar[tuple[float, ...]]
     splits: ClassVar[tuple[float, ...]] = (1.0,)  #: factor in each of as many equal parts of the survey's time
+    by_rings: ClassVar[bool] = False  #: True if the parts are every n-th ring, one turn of the spin each, in turn
 
     def factor(self, time_s: Vector, site: Site) -> Vector:
         """Return the factor of the split that each time is in."""
         if len(set(self.splits)) == 1:
             return np.full(len(time_s), self.splits[0])
-        whole = site.pointed(self.name).model.duration_days * SECONDS_PER_DAY
-        place = np.floor(np.asarray(time_s) / whole * len(self.splits)).astype(int)
-        return np.array(self.splits)[np.clip(place, 0, len(self.splits) - 1)]
+        model, number = site.pointed(self.name).model, len(self.splits)
+        part_s = model.spin_period_s if self.by_rings else model.duration_days * SECONDS_PER_DAY / number
+        place = np.floor(np.asarray(time_s) / part_s).astype(int)
+        return np.array(self.splits)[place % number if self.by_rings else np.clip(place, 0, number - 1)]
 
     def over_time(self, time_s: Vector, psi: Vector | None, site: Site) -> Vector:
         """Return constant, pattern or wave."""

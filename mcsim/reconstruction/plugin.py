@@ -110,7 +110,9 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
     """Return the name of the form, and its class variables."""
     pattern, alike = _numbers(structure, theta), structure.split == ALIKE
     acting: dict[str, Any]
-    splits = {} if alike else {"splits": _factors(structure.split, scene.splits)}
+    splits: dict[str, Any] = {} if alike else {"splits": _factors(structure.split, scene.splits)}
+    if splits and scene.by_rings:
+        splits |= {"by_rings": True}
     timed: dict[str, Any] = {"coefficients": pattern, **splits}
     if structure.kind.startswith(HISTORIES):
         timed = {"coefficients": (1.0,), "splits": pattern}

@@ -102,8 +102,9 @@ class Scene:
     split_orders: int  #: highest order of a beam that is measured in each map by itself
     views: tuple[View, ...]  #: maps, channel by channel
     #: directions elsewhere in the frame of each channel's beam (x, y, outward) with weights, shape (n, 4), by what
-    #: is there, if it is known when and how every sample was pointed, and splits are spans of time; else none
+    #: is there, if it is known when and how every sample was pointed, and splits are no sets; else none
     elsewhere: tuple[Mapping[str, Matrix], ...]
+    by_rings: bool  #: True if splits are every n-th ring, and not parts of the survey's time
     time_lines: tuple[TimeLine, ...]  #: of every channel, if the pointing of every sample is known; else none
     #: variance of the score of a source in every pixel, of the maps in which it is looked for together
     spreads: tuple[Map, ...] = ()

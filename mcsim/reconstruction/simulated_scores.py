@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -18,7 +18,7 @@ from mcsim.datavector.analysis import Analysis, Job, Kinds, analysis_for, simula
 from mcsim.datavector.campaign import Ask, seeded
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import FilteredMaps, Model, sky_variance, wiener_filter
-from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel
+from mcsim.instrument.scan import MapGrid
 from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.reconstruction import sources
 from mcsim.reconstruction.choices import Choice, angle_apart, frequency_apart
@@ -41,7 +41,7 @@ from mcsim.reconstruction.scores import (
 from mcsim.reconstruction.search import LEVEL, Search, evidence
 from mcsim.simulation import simulate
 from mcsim.simulation.pixel_means import Part, signal_of
-from mcsim.simulation.tod import samples
+from mcsim.simulation.tod import Samples, every_ring, samples
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.support import folders
@@ -83,12 +83,30 @@ CODE = (
 """What scores of simulations are computed with."""
 
 
+@dataclass(frozen=True)
+class Observing:
+    """When and where a map is observed: its share of the survey on a grid, and of that every n-th ring from one on."""
+
+    grid: MapGrid
+    rings: tuple[int, int] | None = None
+
+    def thinned(self, pointing: Pointing, most: int, angles: bool = True) -> Iterator[Samples]:
+        """Yield ``most`` samples of the map, about, or as many as there are."""
+        model, line, grid = pointing.model, pointing.line, self.grid
+        whole = most * (1 if self.rings is None else self.rings[0])
+        period = model.duration_days * SECONDS_PER_DAY * np.ptp(grid.time_range) / whole
+        if period > model.period_of_samples(line):
+            model, line = model.with_sampling(period), replace(line, sample_period_s=None)
+        stream = samples(model, line, grid, angles=angles)
+        return stream if self.rings is None else every_ring(model.spin_period_s, *self.rings)(stream)
+
+
 def scene_of(model: Model) -> Scene:
     """Return the maps of a model as the grammar needs them."""
     run = model.survey.config
     splits = run.map.splits or ("",)
     sites = [channel.site for channel in model.survey.channels]
-    timed = run.map.split_by == "time" and all(site.pointing is not None for site in sites)
+    timed = run.map.split_by != "sets" and all(site.pointing is not None for site in sites)
     pointed = [site.pointed("a wave").line for site in sites] if timed else []
     lines = tuple((line.boresight_angle_deg, line.azimuth_deg) for line in pointed)
     elsewhere = [directions(own, dict(zip(model.channels, lines, strict=True))) for own in lines]
@@ -102,10 +120,11 @@ def scene_of(model: Model) -> Scene:
         measured = part.moments.w[: model.settings.beam_orders]
         moments = np.where(np.isfinite(measured), measured, 0.0)
         waves |= {f"orientation {s + 1}": (w.real, -w.imag) for s, w in enumerate(moments[:ORDERS])}
-        grid = MapGrid(model.nside, model.frame, run.map.span(split))
-        seen = _elsewhere(channel.site.pointed("elsewhere"), grid, elsewhere[part.channel]) if timed else {}
+        own = Observing(MapGrid(model.nside, model.frame, run.map.span(split)), run.map.rings(split))
+        whole = replace(own, rings=None)  # as orientation moments are
+        seen = _elsewhere(channel.site.pointed("elsewhere"), whole, elsewhere[part.channel]) if timed else {}
         response = model.response[part.channel]
-        moving = _moving(channel.site.pointed("a beam"), grid) if timed else {}
+        moving = _moving(channel.site.pointed("a beam"), own) if timed else {}
         views.append(View(part.channel, split, moments, waves, moving, seen, {}, {}, part.precision, response, kernel))
     scene = Scene(
         channels=model.channels,
@@ -121,6 +140,7 @@ def scene_of(model: Model) -> Scene:
         split_orders=model.settings.split_beam_orders,
         views=tuple(views),
         elsewhere=tuple(elsewhere),
+        by_rings=run.map.split_by == "rings",
         time_lines=tuple(_time_line(model, channel) for channel in range(len(model.channels))) if timed else (),
     )
     other = replace(model.survey, config=seeded(run, SEED))
@@ -163,23 +183,15 @@ def _time_line(model: Model, channel: int) -> TimeLine:
     dipole = site.dipole_uk @ healpix.centres(model.nside)
     squares: tuple[float | Map, ...] = 1.0, dipole**2 + sky
     for split, i in enumerate(members):
-        grid = MapGrid(model.nside, model.frame, run.map.span(split))
+        own = Observing(MapGrid(model.nside, model.frame, run.map.span(split)), run.map.rings(split))
         total = csr_matrix(shape)
-        for chunk in samples(*_thinned(pointing, grid, VISITS), grid, angles=False):
+        for chunk in own.thinned(pointing, VISITS, angles=False):
             spans = np.minimum((chunk.time_s / span_s).astype(int), shape[0] - 1)
             total += csr_matrix((np.ones(len(spans)), (spans, chunk.pixel)), shape)
         visits.append(total @ diags(divided(1.0, total.sum(axis=0).A1)))
         for on, square in zip(PERIODIC, squares, strict=True):
             weights[on].append(model.parts[i].precision * square)
     return TimeLine.of(tuple(visits), span_s, weights)
-
-
-def _thinned(pointing: Pointing, grid: MapGrid, most: int) -> tuple[ScanModel, LineOfSight]:
-    """Return a scan and its line of sight with ``most`` samples in a map, about, or as many as there are."""
-    period = pointing.model.duration_days * SECONDS_PER_DAY * np.ptp(grid.time_range) / most
-    if period <= pointing.model.period_of_samples(pointing.line):
-        return pointing.model, pointing.line
-    return pointing.model.with_sampling(period), replace(pointing.line, sample_period_s=None)
 
 
 def directions(own: tuple[float, float], lines: Mapping[str, tuple[float, float]]) -> dict[str, Matrix]:
@@ -201,12 +213,12 @@ def directions(own: tuple[float, float], lines: Mapping[str, tuple[float, float]
     return seen | {"opposite": np.array([[0.0, 0.0, -1.0, 1.0]]), "lag": np.array([*lag, [0.0, 0.0, 1.0, -1.0]])}
 
 
-def _elsewhere(pointing: Pointing, grid: MapGrid, wanted: Mapping[str, Matrix]) -> dict[str, csr_matrix]:
+def _elsewhere(pointing: Pointing, observed: Observing, wanted: Mapping[str, Matrix]) -> dict[str, csr_matrix]:
     """Return the mean over the samples of every coarse pixel of what a map has in other directions."""
-    model, line = _thinned(pointing, grid, SAMPLES)
-    nside = coarse(grid.nside)
+    nside = coarse(observed.grid.nside)
+    of_coarse = replace(observed, grid=replace(observed.grid, nside=nside))
     total = {name: csr_matrix((12 * nside**2, 12 * nside**2)) for name in wanted}
-    for chunk in samples(model, line, replace(grid, nside=nside)):
+    for chunk in of_coarse.thinned(pointing, SAMPLES):
         outward, south, east = axes(chunk.theta, chunk.phi)
         x, y = (np.cos(a) * south + np.sin(a) * east for a in (chunk.psi, chunk.psi + 0.5 * np.pi))
         for name, (a, b, c, weight) in ((name, one) for name, rows in wanted.items() for one in rows):
@@ -216,12 +228,13 @@ def _elsewhere(pointing: Pointing, grid: MapGrid, wanted: Mapping[str, Matrix]) 
     return {name: diags(divided(1.0, hits)) @ one for name, one in total.items()}
 
 
-def _moving(pointing: Pointing, grid: MapGrid) -> dict[tuple[str, int], NDArray[np.complex128]]:
+def _moving(pointing: Pointing, observed: Observing) -> dict[tuple[str, int], NDArray[np.complex128]]:
     """Return :attr:`View.moving` of a map."""
+    grid = observed.grid
     followed = [(wave, s) for wave in MOVING for s in range(1, MOVED + 1)]
     total = {one: np.zeros((2, grid.npix), dtype=np.complex128) for one in (*followed, (SUN, 1))}
     hits = np.zeros(grid.npix)
-    for chunk in samples(*_thinned(pointing, grid, VISITS), grid):
+    for chunk in observed.thinned(pointing, VISITS):
         year = 2.0 * np.pi * chunk.time_s / pointing.model.orbit_period_s
         phases = {"year": year, "spin": spin_phase(pointing, chunk.time_s)}
         hits += np.bincount(chunk.pixel, minlength=grid.npix)

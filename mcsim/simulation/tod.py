@@ -177,12 +177,16 @@ def white_noise(sigma0_uk: float, rng: np.random.Generator, factor: Map | None =
 
 
 def every_ring(spin_period_s: float, number: int, index: int) -> Stage:
-    """Return a stage that keeps every ``number``-th ring, one turn of the spin each, from ring ``index`` on."""
+    """Return a stage that keeps every ``number``-th ring, one turn of the spin each, from ring ``index`` on.
+
+    Chunks may be without angles.
+    """
 
     def stage(stream: Iterable[Samples]) -> Iterator[Samples]:
         for chunk in stream:
             own = np.floor(chunk.time_s / spin_period_s).astype(np.int64) % number == index
-            yield Samples(**{each.name: getattr(chunk, each.name)[own] for each in fields(chunk)})
+            every = {each.name: getattr(chunk, each.name) for each in fields(chunk)}
+            yield Samples(**{name: values[own] if values.size else values for name, values in every.items()})
 
     return stage
 
