@@ -1,6 +1,7 @@
 """Folders that appear complete or not at all, and the cache that all processes share."""
 
 import errno
+import json
 import os
 import shutil
 import tempfile
@@ -68,9 +69,23 @@ def outside_stores(path: Path, filled: bool = False) -> None:
     """
     real = Path(os.path.realpath(path))
     for one in (real, *real.parents) if filled else real.parents:
-        if (one / "zarr.json").is_file():
+        if _is_store(one):
             where = "is a store" if one == real else f"is within the store {one}"
             raise InputError(f"{path} {where}, and nothing is written into one; choose a place outside it.")
+
+
+def _is_store(folder: Path) -> bool:
+    """Return True for a Zarr array, or a group with arrays; a group of groups alone may have further ones."""
+    if not (folder / "zarr.json").is_file():
+        return False
+    return any(_is_array(one) for one in (folder / "zarr.json", *folder.glob("*/zarr.json")))
+
+
+def _is_array(metadata: Path) -> bool:
+    try:
+        return bool(json.loads(metadata.read_bytes())["node_type"] == "array")
+    except (ValueError, KeyError, TypeError, OSError):
+        return True  # of a damaged store
 
 
 def is_full(error: BaseException | None) -> bool:

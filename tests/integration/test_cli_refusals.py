@@ -230,3 +230,14 @@ def test_nothing_is_written_into_a_store(words: tuple[str, ...], mcsim: Command,
     named = {"link/sub.nc": tmp_path / "link", "copy.zarr": "copy.zarr"}
     assert_refused(mcsim(*words), named.get(words[-1], copy))
     assert sorted(copy.rglob("*")) == before
+
+
+def test_a_store_may_stand_in_a_group_of_stores(mcsim: Command, copy: Path, tmp_path: Path) -> None:
+    group = tmp_path / "all.zarr"
+    group.mkdir()
+    (group / "zarr.json").write_text('{"zarr_format": 3, "node_type": "group"}')
+    assert mcsim("merge", copy, "-o", "all.zarr/first")[0] == 0
+    assert mcsim("merge", copy, "-o", "all.zarr/second")[0] == 0
+    assert_refused(mcsim("merge", copy, "-o", "all.zarr/first/biposh/third"), "all.zarr/first/biposh/third")
+    (copy / "zarr.json").write_text("cut")
+    assert_refused(mcsim("merge", group / "first", "-o", "copy.zarr/sub"), "copy.zarr/sub")
