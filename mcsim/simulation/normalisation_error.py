@@ -32,16 +32,16 @@ def normalisation_error(filtering: Filtering, mean: NDArray[np.complex128]) -> N
     number, 5 % for a hundred (``tests/statistical/test_normalisation_error.py``).
     """
     found, drawn = np.full(mean.shape, np.nan), filtering.drawn
-    for row, bands, (x, y), given, response in zip(
-        found, filtering.bands, filtering.pairs, mean, filtering.fisher(), strict=True
+    matrices = zip(filtering.fisher(), filtering.inverses, strict=True)
+    for row, bands, (x, y), given, (response, inverse) in zip(
+        found, filtering.bands, filtering.pairs, mean, matrices, strict=True
     ):
         mode, place, part = bands.numbers
         numbers, size = np.where(part == 0, given.real[mode, place], given.imag[mode, place]), bands.size
         variances = np.zeros(size)
         if drawn:
             rest = drawn * (drawn - 1) / (2.0 if x == y else 1.0) - size
-            diagonal = response.unbiased * np.diag(np.linalg.inv(response.matrix))
-            square = (rest - 1.0) * diagonal * (numbers @ response.matrix @ numbers) + (rest + 1.0) * numbers**2
+            square = (rest - 1.0) * np.diag(inverse) * (numbers @ response.matrix @ numbers) + (rest + 1.0) * numbers**2
             variances = square / (rest * (rest - 3.0)) if rest > 3.0 else np.full(size, np.inf)
         both = bands.spectra(variances)
         row[:] = np.sqrt(both.real + both.imag)
