@@ -41,6 +41,8 @@ class Layout:
         if self.filtered:
             text = "quadratic maximum-likelihood l(l+1)/2pi A^{LM}, by bin"
             spectra["biposh_qml"] = (("pair", "mode", "bin"), "complex128", "uK^2", text)
+            text = "derivative of the log-likelihood by biposh_qml, before the mean field is taken off"
+            spectra["biposh_qml_score"] = (("pair", "mode", "bin"), "complex128", "uK^-2", text)
         found = dict(spectra)
         if self.paired:
             for name, (dims, dtype, unit, text) in spectra.items():

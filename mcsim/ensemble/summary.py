@@ -13,12 +13,14 @@ from mcsim.config.preparation import frame_of
 from mcsim.ensemble.layout import Layout
 from mcsim.stats import streaming
 from mcsim.stats.streaming import Sums
+from mcsim.stats.wishart import inverse_variance
 from mcsim.support.arrays import divided
 
 if TYPE_CHECKING:
     import xarray as xr
 
-QML = "biposh_qml"  #: start of the names of quadratic maximum-likelihood estimates
+QML, SCORE = "biposh_qml", "biposh_qml_score"
+"""Start of the names of quadratic maximum-likelihood estimates, and of what is normalised to give them."""
 
 
 @lru_cache(maxsize=2)
@@ -70,13 +72,41 @@ def reduce_rows(layout: Layout, rows: Mapping[str, NDArray]) -> Sums | None:
             return None
         values = {name: array[row] for name, array in rows.items() if name != "done"}
         if layout.paired:
-            for name in ("biposh", "cl", "biposh_qml") if layout.filtered else ("biposh", "cl"):
+            for name in [name for name in ("biposh", "cl", QML, SCORE) if name in values]:
                 values[f"{name}_difference"] = values[name] - values[f"{name}_circular"]
+        values = {name: x for name, x in values.items() if not name.startswith(SCORE) or name.endswith("difference")}
         wide = [name for name in values if name.startswith("biposh") and not name.startswith(QML)]
         bins = {f"{name}_binned": binned(layout, values[name]) for name in wide}
-        return streaming.leaf(values | bins, covariance_of=(*bins, *(name for name in values if name.startswith(QML))))
+        estimates = [name for name in values if name.startswith(QML) and not name.startswith(SCORE)]
+        return streaming.leaf(values | bins, covariance_of=(*bins, *estimates))
 
     return streaming.tree(node, len(rows["done"]))
+
+
+def of_normalisation(layout: Layout, sums: Sums, probes: int) -> NDArray[np.float64]:
+    """Return the error of the mean difference of filtered estimates that all realizations share, (pair, mode, bin).
+
+    It is that of the estimate of F by random probes, uK^2: zero without probes, or in stores that do not have the
+    scores F alpha.
+
+    Notes
+    -----
+    The variances of numbers for one isotropic sky, the diagonal of F^-1, are those of the controls over realizations.
+    """
+    found = np.zeros(sums.mean[f"{QML}_difference"].shape)
+    if not probes or f"{SCORE}_difference" not in sums.mean:
+        return found
+    parts = np.where([mode.M > 0 for mode in layout.modes], 2, 1)[:, None]
+    variances = streaming.standard_deviation(sums, f"{QML}_circular") ** 2
+    for row, label, numbers, score, variance in zip(
+        found, layout.pairs, sums.mean[f"{QML}_difference"], sums.mean[f"{SCORE}_difference"], variances, strict=True
+    ):
+        x, _, y = label.partition(",")
+        size = int(np.sum(parts * np.isfinite(numbers)))
+        total = float(np.nansum((numbers * score.conj()).real))
+        pairs = probes * (probes - 1) / (2.0 if x == y else 1.0)
+        row[:] = np.sqrt(inverse_variance(variance, np.abs(numbers) ** 2, total, size, pairs))
+    return found
 
 
 _MEANING = {
@@ -97,7 +127,7 @@ def dataset(layout: Layout, sums: Sums, attributes: Mapping[str, Any]) -> "xr.Da
     import xarray as xr  # here: workers start an eighth faster without it
 
     variables: dict[str, tuple[Sequence[str], NDArray, dict[str, str]]] = {}
-    for name in sums.mean:
+    for name in [name for name in sums.mean if not name.startswith(SCORE)]:
         raw = name.removesuffix("_binned")
         kind = raw.removeprefix(QML).removeprefix("biposh").removeprefix("cl")
         last = "ell" if raw == name and not raw.startswith(QML) else "bin"
@@ -108,9 +138,13 @@ def dataset(layout: Layout, sums: Sums, attributes: Mapping[str, Any]) -> "xr.Da
         elif raw != name:
             meaning = f"l(l+1)/2pi A, mean over the bin, {meaning}"
         deviation = streaming.standard_deviation(sums, name)
+        error, of_mean = deviation / np.sqrt(sums.count), "standard error of the mean"
+        if name == f"{QML}_difference":
+            error = np.hypot(error, of_normalisation(layout, sums, attributes.get("probes", 0)))
+            of_mean += ", that of the normalisation by random probes included"
         for suffix, array, text in (
             ("mean", sums.mean[name], "mean"),
-            ("standard_error", deviation / np.sqrt(sums.count), "standard error of the mean"),
+            ("standard_error", error, of_mean),
             ("standard_deviation", deviation, "standard deviation of one realization"),
         ):
             variables[f"{name}_{suffix}"] = (dims, array, {"units": "uK^2", "long_name": f"{meaning}: {text}"})

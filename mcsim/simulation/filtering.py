@@ -323,18 +323,19 @@ class Filtering:
         """Return the spectra of filtered maps.
 
         ``biposh`` (pair, mode, lmax + 1) and ``cl`` (pair, lmax + 1), normalised degree by degree, and ``biposh_qml``
-        (pair, mode, bin), F^-1 q, all in uK^2 and before the mean field is taken off.
+        (pair, mode, bin), F^-1 q, all in uK^2 and before the mean field is taken off; ``biposh_qml_score`` is q, uK^-2.
         """
         shape = (len(self.pairs), len(self.tables.modes), self.tables.lmax + 1)
         biposh, cl = np.empty(shape, dtype=np.complex128), np.empty((shape[0], shape[2]))
-        qml = np.empty((*shape[:2], len(self.bands[0].first)), dtype=np.complex128)
+        qml, score = np.empty((2, *shape[:2], len(self.bands[0].first)), dtype=np.complex128)
         monopole = self.tables.modes.index(Mode(0, 0, 0))
         for row, ((x, y), bands, inverse) in enumerate(zip(self.pairs, self.bands, self.inverses, strict=True)):
             raw = estimate(self.tables, filtered[x], None if x == y else filtered[y])
             biposh[row] = self.per_ell[row] * raw
             cl[row] = self.per_ell[row, monopole] * power_spectrum(filtered[x], filtered[y], self.tables.lmax)
-            qml[row] = bands.spectra(inverse @ bands.sums(raw))
-        return {"biposh": biposh, "cl": cl, "biposh_qml": qml}
+            q = bands.sums(raw)
+            qml[row], score[row] = bands.spectra(inverse @ q), bands.spectra(q)
+        return {"biposh": biposh, "cl": cl, "biposh_qml": qml, "biposh_qml_score": score}
 
     def errors(self) -> NDArray[np.float64]:
         """Return the standard deviation of ``biposh_qml`` of an isotropic sky for single maps, (pair, mode, bin).

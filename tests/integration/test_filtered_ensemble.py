@@ -12,9 +12,9 @@ from mcsim.ensemble import plan
 from mcsim.ensemble.tables import write
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
+from mcsim.stats.wishart import inverse_variance
 from refusals import refused
 
-pytestmark = pytest.mark.filterwarnings("ignore:biposh_qml_difference_standard_error")  # of few probes
 REALIZATIONS = 12
 
 
@@ -39,8 +39,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> dict:
 
 @pytest.fixture(scope="module")
 def store(table: dict, client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    with pytest.warns(UserWarning, match="24 random probes"):
-        return run(table, tmp_path_factory.mktemp("store") / "whole.zarr", workers=client).store
+    return run(table, tmp_path_factory.mktemp("store") / "whole.zarr", workers=client).store
 
 
 def test_store_has_what_a_realization_gives_and_says_what_it_is(table, store: Path) -> None:
@@ -57,6 +56,30 @@ def test_store_has_what_a_realization_gives_and_says_what_it_is(table, store: Pa
         assert found.biposh_qml_covariance.dims == ("pair", "mode", "bin", "bin_2")
         mean = stored.biposh_qml.mean("realization").values
         np.testing.assert_allclose(found.biposh_qml_mean.values, mean, rtol=1e-10)
+
+
+def test_errors_of_differences_have_that_of_their_normalisation(table, store: Path) -> None:
+    """With 24 probes it is as large as the scatter of 12 realizations: as F itself has it, and in quadrature."""
+    filtering = survey(config.load(table)).filtering
+    assert filtering is not None
+    with open_ensemble(store) as stored, open_summary(store) as found:
+        scores = (stored.biposh_qml_score - stored.biposh_qml_score_circular).mean("realization").values
+        means, errors = (found[f"biposh_qml_difference_{name}"].values for name in ("mean", "standard_error"))
+        scatters = found.biposh_qml_difference_standard_deviation.values / np.sqrt(REALIZATIONS)
+        variances = found.biposh_qml_circular_standard_deviation.values**2
+    for row, (bands, (x, y), (matrix, unbiased)) in enumerate(
+        zip(filtering.bands, filtering.pairs, filtering.fisher(), strict=True)
+    ):
+        mode, place, part = bands.numbers
+        alpha, q = (
+            np.where(part == 0, one.real[mode, place], one.imag[mode, place]) for one in (means[row], scores[row])
+        )
+        estimate = unbiased * np.linalg.solve(matrix, q)
+        np.testing.assert_allclose(estimate, alpha, rtol=1e-8, atol=1e-8 * np.abs(alpha).max())
+        total, pairs = float(alpha @ matrix @ alpha) / unbiased, 24 * 23 / (2.0 if x == y else 1.0)
+        shared = inverse_variance(variances[row], np.abs(means[row]) ** 2, total, bands.size, pairs)
+        np.testing.assert_allclose(errors[row], np.sqrt(scatters[row] ** 2 + shared), rtol=1e-8)
+        assert 0.5 < np.sqrt(np.nanmean(shared) / np.nanmean(scatters[row] ** 2)) < 5.0
 
 
 def test_slices_and_resumption_give_the_same_bits(table, client: Client, store: Path, tmp_path: Path) -> None:

@@ -1,17 +1,14 @@
 """The error that random probes give to the normalisation of filtered estimates, against many sets of probes."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from mcsim import config
-from mcsim.ensemble.few_probes import warn_of_probes
 from mcsim.simulation.filtering import Filtering
-from mcsim.simulation.normalisation_error import normalisation_error
 from mcsim.simulation.survey import survey
+from mcsim.stats.wishart import inverse_variance
 
 PROBES, SETS = 16, 60
 
@@ -42,50 +39,24 @@ def filtering() -> Filtering:
 
 
 def test_the_error_is_the_scatter_over_sets_of_probes(filtering: Filtering) -> None:
-    """Of the estimate of a mean of several S/N, the root of the mean variance within three of its errors."""
+    """Of the estimate of a mean of several S/N, the mean variance over the expected one within three of its errors."""
     [bands], [one] = filtering.bands, filtering.filters
     probes = [(one.probe(number),) for number in range(PROBES * SETS)]
     exact = filtering.response(probes[:300], 0).matrix
-    errors = np.sqrt(np.diag(np.linalg.inv(exact)))
+    variances = np.diag(np.linalg.inv(exact))
     first = np.array([mode.L for mode in bands.modes])[bands.numbers[0]] == 0
-    for numbers in (np.where(first, 10.0 * errors, 0.0), np.where(first, 0.0, 3.0 * errors)):
+    for numbers in (np.where(first, 10.0, 0.0) * np.sqrt(variances), np.where(first, 0.0, 3.0) * np.sqrt(variances)):
         found = []
         for row in range(SETS):
             matrix, unbiased = filtering.response(probes[row * PROBES : (row + 1) * PROBES], 0)
             found.append(unbiased * np.linalg.solve(matrix, exact @ numbers))
-        mode, place, _ = bands.numbers
-        mean = bands.spectra(numbers)[None]
-        expected = normalisation_error(filtering, mean)[0]
-        both = np.zeros(expected.shape)
-        np.add.at(both, (mode, place), np.var(found, axis=0, ddof=1))
-        ratio = np.mean(both[mode, place] / expected[mode, place] ** 2)
+        total = float(numbers @ exact @ numbers)
+        expected = inverse_variance(variances, numbers**2, total, bands.size, PROBES * (PROBES - 1) / 2.0)
+        ratio = np.mean(np.var(found, axis=0, ddof=1) / expected)
         assert abs(ratio - 1.0) < 3.0 * np.sqrt(2.0 / (SETS - 1))
 
 
-def test_few_probes_are_warned_of(filtering: Filtering) -> None:
-    """With the number of probes that the warning names there is none."""
-    [bands] = filtering.bands
-    shape = (1, len(bands.modes), len(bands.first))
-    mean = np.ones(shape, dtype=complex)
-    error = normalisation_error(filtering, mean)
-    assert np.isfinite(error).sum() == len(set(zip(*bands.numbers[:2], strict=True)))
-
-    def summary(ratio: float) -> xr.Dataset:
-        dims = ("pair", "mode", "bin")
-        return xr.Dataset({"biposh_qml_mean": (dims, mean), "biposh_qml_standard_error": (dims, error / ratio)})
-
-    with pytest.warns(UserWarning, match=rf"{PROBES} random probes.* 5 times .*biposh.probes = {10 * PROBES} or more"):
-        warn_of_probes(filtering, summary(5.0))
-    warn_of_probes(filtering, summary(0.4))
-    more = replace(filtering, probes=10 * PROBES)
-    left = normalisation_error(more, mean)
-    known = np.isfinite(left)
-    assert np.sqrt(np.mean((5.0 * left[known] / error[known]) ** 2)) < 0.55
-
-
-def test_uniform_noise_on_the_full_sky_needs_no_probes() -> None:
-    exact = survey(config.load(RUN)).filtering
-    assert exact is not None
-    [bands] = exact.bands
-    mean = np.ones((1, len(bands.modes), len(bands.first)), dtype=complex)
-    assert np.nanmax(normalisation_error(exact, mean)) == 0.0
+def test_too_few_draws_tell_nothing() -> None:
+    one = np.ones(1)
+    assert np.isinf(inverse_variance(one, one, 1.0, 12, 15.0)).all()
+    assert inverse_variance(one, one, 1.0, 12, 1e6) == pytest.approx(2e-6, rel=1e-4)

@@ -121,7 +121,9 @@ def compared(shared: Survey, filtered: xr.Dataset, plain: xr.Dataset) -> dict[st
                 continue
             one = filtered.sel(pair=pair, mode=mode.name)
             other = plain.sel(pair=pair, mode=mode.name)
-            mean, error = one.biposh_qml_difference_mean.values, one.biposh_qml_difference_standard_error.values
+            # The stored error has that of the normalisation, which is computed here.
+            error = one.biposh_qml_difference_standard_deviation.values / np.sqrt(one["count"].item())
+            mean = one.biposh_qml_difference_mean.values
             total = np.hypot(error, uncertain[row]) / (np.sqrt(2.0) if mode.M else 1.0)  # of one part
             part = np.imag if mode.M == 0 and mode.parity == "odd" else np.real
             scatter = other.biposh_binned_standard_deviation.values

@@ -5,13 +5,12 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from distributed import Client, KilledWorker
 
 from mcsim import config
 from mcsim.ensemble import plan, repair, store, summary
-from mcsim.ensemble.few_probes import warn_of_probes
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.ensemble.lock import locked
 from mcsim.ensemble.runner.cluster import LOST, Roll, Workers, answers, check_workers, connected, death
@@ -23,9 +22,6 @@ from mcsim.simulation.survey import Survey, survey
 from mcsim.stats import streaming
 from mcsim.stats.streaming import Sums
 from mcsim.support.progress import Journal, reporting
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 
 @dataclass(frozen=True)
@@ -142,8 +138,14 @@ def _written_down(journal: Journal, run: config.RunConfig, wanted: range) -> Ite
     journal.write("end: store released")
 
 
+def _attributes(shared: Survey) -> dict[str, Any]:
+    """Return the attributes of a store; of filtered maps with the number of random probes that normalise them."""
+    probes = {} if shared.filtering is None else {"probes": shared.filtering.drawn}
+    return plan.attributes(shared.config) | probes
+
+
 def _mend(target: Path, shared: Survey, journal: Journal, quiet: bool) -> None:
-    verdict = repair.mend(target, plan.layout(shared), plan.attributes(shared.config), quiet)
+    verdict = repair.mend(target, plan.layout(shared), _attributes(shared), quiet)
     for damage in verdict.damages:
         if damage.lost:
             journal.write(f"damaged, to be computed again: {listed(damage.lost)} ({damage.reason})", aloud=True)
@@ -155,11 +157,11 @@ def _run(client: Client, shared: Survey, target: Path, wanted: range, journal: J
     """Make or extend the store, compute what is missing, summarise."""
     run, layout = shared.config, plan.layout(shared)
     if not target.exists():
-        store.create(target, layout, plan.attributes(run))
+        store.create(target, layout, _attributes(shared))
     plan.check_same(target, run)
     size, found = store.size(target), store.attributes(target)["configuration"]
     if run.ensemble.realizations > size:
-        store.extend(target, run.ensemble.realizations, plan.attributes(run))
+        store.extend(target, run.ensemble.realizations, _attributes(shared))
     elif found["biposh"]["summary_bin"] != layout.bin_width:
         biposh = found["biposh"] | {"summary_bin": layout.bin_width}
         store.extend(target, size, {"configuration": found | {"biposh": biposh}})
@@ -168,9 +170,7 @@ def _run(client: Client, shared: Survey, target: Path, wanted: range, journal: J
     try:
         roll = Roll(client, journal)
         failures = _simulate(roll, target, run, wanted, journal)
-        made = _summarise(roll, target, layout, journal.quiet)
-        if made is not None and shared.filtering is not None:
-            warn_of_probes(shared.filtering, made)
+        _summarise(roll, target, layout, journal.quiet)
     except (KilledWorker, *LOST) as error:
         lost = "The connection to the scheduler is lost"
         reason = f"The summary cannot be made, for {death(error)}" if isinstance(error, KilledWorker) else lost
@@ -228,8 +228,7 @@ def _outcomes(
                 yield outcome if killed is None else (0, [Failure(r, death(killed))])
 
 
-def _summarise(roll: Roll, target: Path, layout: Layout, quiet: bool) -> "xr.Dataset | None":
-    """Write the summary, and return it; None if no realization is finished."""
+def _summarise(roll: Roll, target: Path, layout: Layout, quiet: bool) -> None:
     size, node = layout.realizations, layout.chunk
     while node * 16 < size:
         node *= 2
@@ -247,8 +246,5 @@ def _summarise(roll: Roll, target: Path, layout: Layout, quiet: bool) -> "xr.Dat
             return arrived.pop(index)
 
         total = streaming.tree(result, len(calls))
-    if total is None:
-        return None
-    made = summary.dataset(layout, total, store.attributes(target))
-    store.write_summary(target, made)
-    return made
+    if total is not None:
+        store.write_summary(target, summary.dataset(layout, total, store.attributes(target)))
