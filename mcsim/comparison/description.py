@@ -1,13 +1,17 @@
 """The run that describes side A: without noise and effects, and with all that its files say of samples and beams."""
 
 from dataclasses import replace
+from typing import Any
 
-from mcsim import config
+from mcsim import config, systematics
 from mcsim.ensemble.external import named_source
 from mcsim.errors import InputError
-from mcsim.simulation.channels import described, known_offsets, load_beam, with_all_orders
+from mcsim.simulation.channels import described, effects_on, known_offsets, load_beam, site_of, with_all_orders
 
 SAMPLES = 100_000_000  #: samples of the longest survey that is simulated sample by sample
+STAGES = ("sky", "beam", "pointing", "gain", "signal", "spread", "orientations")
+"""Where an effect must act to change a map without noise."""
+
 EXTRA_ORDERS = 3  #: moments beyond the beam's orders: a displaced beam has them
 
 
@@ -54,6 +58,28 @@ def in_full(run: config.RunConfig) -> tuple[config.RunConfig, dict[str, int]]:
     full = with_all_orders(with_known_offsets(run))
     pairs = zip(run.channels, full.channels, strict=True)
     return full, {own.name: load_beam(own, run.sky.lmax).mmax for own, whole in pairs if own.beam != whole.beam}
+
+
+def with_own_beams(run: config.RunConfig) -> config.RunConfig:
+    """Return a run whose beams have the shape that its effects give them, and which keeps its other effects alone."""
+    channels, done = [], set[str]()
+    for spec in run.channels:
+        acting = [effect for effect in effects_on(run, spec.name) if _shapes(effect)]
+        if acting:
+            found = systematics.seen_through(acting, site_of(run, spec))
+            table: Any = found  # an object stands for a file
+            kept_beam: Any = replace(spec, beam=table).beam
+            spec = replace(spec, beam=replace(kept_beam, m_max=found.mmax))
+            done |= {effect.name for effect in acting}
+        channels.append(spec)
+    kept = tuple(one for one in run.effects if systematics.get(one.name).name not in done)
+    return replace(run, channels=tuple(channels), effects=kept)
+
+
+def _shapes(effect: systematics.Effect) -> bool:
+    """Return True for an effect that changes the shape of a beam, and leaves its integral and all else alone."""
+    changed = [stage for stage in STAGES if getattr(type(effect), stage) is not getattr(systematics.Effect, stage)]
+    return changed == ["beam"] and effect.name not in ("calibration", "beam_noncircularity")
 
 
 def orders_of(run: config.RunConfig) -> int:

@@ -8,7 +8,7 @@ import healpy
 import numpy as np
 
 from mcsim import config
-from mcsim.comparison.description import quiet
+from mcsim.comparison.description import STAGES, quiet
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import Maps, Scene
@@ -27,9 +27,6 @@ REDUNDANT = ("monopole_residual", "pixelization", "spectrum")
 
 GAIN = "calibration"
 """A factor of all that samples see, exact at any size: a difference already, but for a dipole that maps lack."""
-
-STAGES = ("sky", "beam", "pointing", "gain", "signal", "spread", "orientations")
-"""Where an effect must act to change a map without noise."""
 
 ROUNDING = 1e-9
 """Largest response to a step over the rms of the maps that rounding makes; those of the library are above 1e-4."""

@@ -26,7 +26,7 @@ def not_compared(
 
 
 def warn_of_effects(run: config.RunConfig) -> None:
-    """Warn of effects of a model, which the description of a side does not have."""
+    """Warn of effects that a description of a side does not have: all but those on the shape of its beam."""
     if run.effects:
         named = ", ".join(dict.fromkeys(one.name for one in run.effects))
         warnings.warn(

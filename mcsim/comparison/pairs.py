@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.comparison.description import SAMPLES, check_splits, in_full, orders_of, quiet, with_known_offsets
+from mcsim.comparison.description import (
+    SAMPLES,
+    check_splits,
+    in_full,
+    orders_of,
+    quiet,
+    with_known_offsets,
+    with_own_beams,
+)
 from mcsim.comparison.missing import not_compared, warn_of_effects
 from mcsim.comparison.result import NotCompared
 from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of
@@ -149,8 +157,9 @@ def read(
     whole: Survey | None = None
     orders: dict[str, int] = {}
     if run is not None:
-        warn_of_effects(run)
         run, orders = in_full(run)
+        run = with_own_beams(run)
+        warn_of_effects(run)
         whole = survey(quiet(run), nthreads, orders=orders_of(run))
     sides = [_side(side, run, described, nthreads) for side in (a, b)]
     for own, other, side in ((0, 1, a), (1, 0, b)):
@@ -192,8 +201,9 @@ def given(a: Given, b: Given, run: config.RunConfig, nthreads: int = 1) -> Compa
     """Compare maps given as arrays, by name or in the order of the run's, uK."""
     names = config.map_names(run)
     a, b = (_in_order(side, names) for side in (a, b))
-    warn_of_effects(run)
     run, orders = in_full(run)
+    run = with_own_beams(run)
+    warn_of_effects(run)
     whole = survey(quiet(run), nthreads, orders=orders_of(run))
     sides = [dict(zip(names, side, strict=True)) for side in (a, b)]
     found = (_pair(name, maps, sides, whole, nthreads) for name, maps in _groups(run).items())

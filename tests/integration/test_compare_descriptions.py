@@ -311,16 +311,42 @@ def test_strong_effects_are_simulated_without_samples(tmp_path, name, size):
 
 def test_a_side_without_effects_describes_itself(tmp_path):
     """Through the beam without its own effect, a side that is a fifth wider had another that is a quarter narrower."""
-    for name, size in (("plain", None), ("wide", 0.2), ("wider", 0.3)):
+    for name, size in (("plain", None), ("wide", 0.2)):
         effect = "" if size is None else f'[[effect]]\nname = "beam_width"\nchannel = "W1"\namplitude = {size}\n'
         (tmp_path / f"{name}.toml").write_text(DESCRIPTION.replace("20.0 }", "20.0, m_max = 4 }") + effect)
-    plain, wide, wider = (tmp_path / f"{name}.toml" for name in ("plain", "wide", "wider"))
+    plain, wide = (tmp_path / f"{name}.toml" for name in ("plain", "wide"))
     found = mcsim.compare(wide, plain)
     assert found.to_dict()["model_describes"] == {"W1": "b"}
     assert names(found) == ["beam_width"]
     assert found.channels[0].differences[0].amplitude == pytest.approx(1.0 / 1.2 - 1.0, rel=2e-3)
-    with pytest.warns(UserWarning, match=r"plain has effects \(beam_width\).*relative to the survey without them"):
-        mcsim.compare(wide, wider)
+
+
+def acting(tmp_path, name, *effects):
+    """Write a description with effects in W1, and return its path."""
+    tables = (f'[[effect]]\nname = "{one}"\nchannel = "W1"\namplitude = {size}\n' for one, size in effects)
+    (tmp_path / f"{name}.toml").write_text(DESCRIPTION.replace("20.0 }", "20.0, m_max = 4 }") + "".join(tables))
+    return tmp_path / f"{name}.toml"
+
+
+@pytest.mark.parametrize(
+    ("own", "other", "named", "size"),
+    [
+        ([("beam_width", 0.2)], [("beam_width", 0.3)], "beam_width", 1.3 / 1.2 - 1.0),
+        ([("beam_ellipticity", 0.3)], [("beam_ellipticity", 0.3), ("beam_coma", 0.05)], "beam_coma", 0.05),
+    ],
+)
+def test_a_side_is_described_through_the_beam_that_its_effects_make(tmp_path, own, other, named, size):
+    """Through the beam without them the width was 0.15, and the coma *unknown*."""
+    found = mcsim.compare(acting(tmp_path, "a", *own), acting(tmp_path, "b", *other))
+    assert names(found) == [named]
+    assert found.channels[0].differences[0].amplitude == pytest.approx(size, rel=2e-3)
+    assert found.channels[0].left < 1e-3
+
+
+def test_other_effects_of_a_description_are_warned_of(tmp_path):
+    own = ("pointing_offset", 60.0), ("beam_width", 0.2)
+    with pytest.warns(UserWarning, match=r"plain has effects \(pointing_offset\).*relative to the survey without them"):
+        mcsim.compare(acting(tmp_path, "a", *own), acting(tmp_path, "b", *own, ("beam_coma", 0.05)))
 
 
 def test_another_spectrum_is_no_cause_where_no_sample_can_be_elsewhere(tmp_path):
