@@ -78,7 +78,7 @@ def with_own_beams(run: config.RunConfig) -> config.RunConfig:
 
 def _shapes(effect: systematics.Effect) -> bool:
     """Return True for an effect that changes the shape of a beam, and leaves its integral and all else alone."""
-    changed = [stage for stage in STAGES if getattr(type(effect), stage) is not getattr(systematics.Effect, stage)]
+    changed = [stage for stage in STAGES if systematics.acts_through(effect, stage)]
     return changed == ["beam"] and effect.name not in ("calibration", "beam_noncircularity")
 
 

@@ -147,8 +147,7 @@ class Effect:
         False: a diagnosis proposes it only where it is asked for by name (``mcsim diagnose --with NAME``), or where it
         explains the data in the place of an effect that is about to be named.
     rank
-        Effects on the shape of a beam act by rank: -2 completes the fiducial beam, -1 stretches it, 1 adds what no
-        other one changes.
+        Order of effects on a beam's shape: -2 completes the fiducial one, -1 stretches, 1 adds what no other changes.
 
     Examples
     --------
