@@ -31,6 +31,9 @@ from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Map, Matrix, Vector
 
 ALTERNATIVES = 3  #: structures that are told beside the best at most
+RESPONSES, LEFT = 6, 1.0
+"""Responses of which that of a structure of several coordinates is made, at most, and chi^2 that they need not fit."""
+
 LARGEST = 2.0  #: amplitude in a part of the data over that in all scores, at most; the least is none
 
 HIDDEN = (
@@ -201,7 +204,7 @@ class Reconstruction:
         """Return what the effect of a structure, fitted to scores, makes of all scores; on average where there is none.
 
         A pattern of few coordinates acts on few modes of this sky: each of them has its own response. Several others
-        have that of their fit and of what it leaves of their scores, because few simulations tell their covariance.
+        have those of their fit and of what it leaves of their scores: few simulations tell their covariance.
         """
         structure, (each, average) = self.search.grammar[member], self.search.response(member, rest)
         theta = each[0]
@@ -211,13 +214,25 @@ class Reconstruction:
             units = float(np.linalg.norm(theta)) * np.eye(structure.size)
             found = units, np.stack([row for one in units if (row := self._made_by(structure, one)) is not None])
         elif structure.size > 1:
-            _, _, (amplitudes,) = self.search.judged([member], rest, [(each, made[None])])
-            ((more, _),) = self.search.fit([structure], rest - amplitudes[0] * made)
-            also = self._made_by(structure, more)
-            found = (each, made[None]) if also is None else (np.stack([theta, more]), np.stack([made, also]))
+            found = self._fitted_out(member, rest, theta, made)
         else:
             found = each, made[None]
         self._trial[member] = found
+        return found
+
+    def _fitted_out(self, member: int, rest: Vector, theta: Vector, made: Vector) -> Response:
+        """Return the response to the fit of a structure and that to what it leaves, again until that is nothing."""
+        structure = self.search.grammar[member]
+        found = theta[None], made[None]
+        for number in range(1, RESPONSES):
+            _, _, (amplitudes,) = self.search.judged([member], rest, [found])
+            theta, made = (amplitudes @ one for one in found)
+            if number > 1 and self.search.fall(structure, rest - made) < LEFT:
+                break
+            ((more, _),) = self.search.fit([structure], rest - made)
+            if not theta.any() or (also := self._made_by(structure, more)) is None:
+                break
+            found = np.stack([theta, more]), np.stack([made, also])
         return found
 
     def _made_by(self, structure: Structure, theta: Vector) -> Vector | None:

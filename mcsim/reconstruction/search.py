@@ -175,12 +175,15 @@ class Search:
 
     @cached_property
     def constants(self) -> dict[int, int]:
-        """Return the structure that is the constant of a function of time, which is measured by itself."""
+        """Return the structure that is the constant of a function of time, which is measured by itself.
+
+        A constant that was subtracted from the maps is not.
+        """
         means = {k: one for k, one in enumerate(self.grammar) if one.kind in MEANS and self.nulls[k] is not None}
         found = {}
         for k, structure in enumerate(self.grammar):
             mean = next((j for j, one in means.items() if structure.extends(one)), None)
-            if mean is not None and self.nulls[k] is not None:
+            if mean is not None and self.nulls[k] is not None and _holds(structure, self.grammar[mean]):
                 found[k] = mean
         return found
 
@@ -329,6 +332,11 @@ class Search:
         own = self.grammar[member].of(centred) @ theta
         return theta[None], (own @ centred / (len(centred) - 1.0))[None]
 
+    def fall(self, structure: Structure, scores: Vector) -> float:
+        """Return the unbiased fall of chi^2 of any structure by itself; 0 of one that the maps do not measure."""
+        null = self._null(structure)
+        return 0.0 if null is None else null.hartlap_factor * null.chi2(structure.of(scores))
+
     def _falls(self, scores: Vector) -> Vector:
         """Return the unbiased fall of chi^2 of every structure by itself."""
         found = np.zeros(len(self.grammar))
@@ -401,6 +409,13 @@ def _firsts(order: Sequence[int], labels: Sequence[Hashable]) -> list[int]:
     for k, label in zip(order, labels, strict=True):
         found.setdefault(label, k)
     return list(found.values())
+
+
+def _holds(structure: Structure, mean: Structure) -> bool:
+    """Return False for a structure of which a mean is no coordinate any more, since it was subtracted from the maps."""
+    own = np.all(structure.rows == mean.rows, axis=1)
+    kept = structure.mix is None or not own.any() or bool(structure.mix[:, own].any())
+    return kept and structure.size > 1
 
 
 def _rarity(structure: Structure) -> float:

@@ -23,7 +23,7 @@ from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.reconstruction import sources
 from mcsim.reconstruction.choices import Choice, angle_apart, frequency_apart
 from mcsim.reconstruction.forms import AddedToSamples
-from mcsim.reconstruction.grammar import structures
+from mcsim.reconstruction.grammar import Structure, structures
 from mcsim.reconstruction.periods import SHORTEST_S, SPANS, TimeLine
 from mcsim.reconstruction.scores import (
     ELONGATION,
@@ -59,6 +59,9 @@ SPREAD = 40  #: simulations by which the variance of the scores of sources is kn
 SEED = 0x6D63 * 1_000 + 4  #: of these simulations; those of the data vector and of the controls have others
 
 PER_TASK = 10
+
+SUBTRACTED = 0.03  #: scatter of the score of a coordinate over the largest, up to which maps do not have it
+
 
 WAVES: dict[str, dict[str, Any]] = {
     **{f"spin {k}": {"wave": "spin", "harmonic": k} for k in range(1, ELONGATION + 1)},
@@ -303,7 +306,22 @@ def _scene(fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings,
 def search_of(analysis: Analysis, scene: Scene, ask: Ask) -> Search:
     """Return the search of the maps of a model."""
     null, count = null_scores(analysis, ask), len(scene.keys)
-    return Search(structures(scene), null[:, :count], _charged(scene, null[:, count:]), analysis.model.has_exact)
+    scores_, exact = null[:, :count], analysis.model.has_exact
+    return Search(_seen(scene, scores_), scores_, _charged(scene, null[:, count:]), exact)
+
+
+def _seen(scene: Scene, simulations: Matrix) -> tuple[Structure, ...]:
+    """Return the structures, those that are added without coordinates that were subtracted from the maps.
+
+    These are monopole and dipole, or the constant of a function of time: their scores hardly scatter.
+    """
+    found = list(structures(scene))
+    for place, one in enumerate(found):
+        spread = one.of(simulations).std(axis=0)
+        kept = spread >= SUBTRACTED * spread.max()
+        if one.stage == "added" and one.kind != "power" and not kept.all():
+            found[place] = replace(one, mix=(np.eye(len(one.rows)) if one.mix is None else one.mix)[kept])
+    return tuple(found)
 
 
 def _charged(scene: Scene, falls: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -329,7 +347,7 @@ def with_peaks(analysis: Analysis, scene: Scene, search: Search, maps: Sequence[
     kinds = tuple(one.kind for one in chosen)
     more = with_chosen(analysis.model, scene, kinds)
     simulations = np.concatenate([search.simulations, null_scores(analysis, ask, kinds)], axis=1)
-    return more, replace(search, grammar=structures(more), simulations=simulations)
+    return more, replace(search, grammar=_seen(more, simulations), simulations=simulations)
 
 
 def _same(scene: Scene, one: Choice, other: Choice) -> bool:

@@ -54,3 +54,23 @@ def test_nothing_is_described_in_perfect_prepared_maps(prepared):
     for realization in range(2, 6):
         maps = list(simulate.maps(data_of(prepared.run), realization))
         assert unlisted.structures_of(ObservedMaps(prepared, maps, ask), scene, search, scored) == ((), None)
+
+
+@pytest.mark.parametrize(("power", "rms_uk", "told"), [(-3.0, 1.0, (-3.0, -2.0)), (1.5, 3.0, (1.5,))])
+def test_light_that_channels_share_is_described_with_nothing_beside_it(prepared, power, rms_uk, told):
+    """Monopole and dipole, which were subtracted, are no coordinates: with them the fit was noise, or left a second.
+
+    Three channels hardly tell -2 from -3.
+    """
+    maps, rng = list(simulate.maps(data_of(prepared.run), 27)), np.random.default_rng(12)
+    seen, steps = np.abs(SKY[2]) > 0.3, prepared.analysis.model.survey.maps[0].preparation.steps
+    pattern = steps[1].apply(np.where(seen, real.field(rng.normal(size=25), *SKY), np.nan))
+    for number, channel in enumerate(prepared.run.channels):
+        there = rms_uk / np.nanstd(pattern) * (channel.frequency_ghz / 94.0) ** power * pattern
+        maps[number] = np.where(seen, maps[number] + there, maps[number])
+    scene = simulated_scores.scene_for(prepared.analysis.job(prepared.run))
+    search = simulated_scores.search_of(prepared.analysis, scene, scored)
+    found, _ = unlisted.structures_of(ObservedMaps(prepared, maps, ask), scene, search, scored)
+    (only,) = found
+    assert (only.stage, only.frame, only.kind, only.channel) == ("added", "sky", "degrees 0-4", None)
+    assert only.index in told
