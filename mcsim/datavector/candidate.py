@@ -43,9 +43,9 @@ class Candidate:
     scatter: Matrix | None = field(default=None, compare=False)
     # Otherwise by how much its effect scatters the data; None if it is not known.
     acting: Acting | None = field(default=None, compare=False)
-    # It is a nuisance as well: its templates are those of the scatter that this makes, and are not refined.
+    # It is a nuisance as well, within its prior: its templates are those of the scatter that this makes.
     nuisance: bool = False
-    # Of another nuisance what one unit of each coordinate adds to the simulations, (p, K), and its prior widths, (K,).
+    # Of any nuisance what one unit of each coordinate adds to the simulations, (p, K), and its prior widths, (K,).
     known: tuple[Matrix, Vector] | None = field(default=None, compare=False)
     step: float | None = None  # amplitude at which its response is measured; None: that of the effect
     fit: Parametrization | None = None  # how these channels let it be fitted; None: as the effect says

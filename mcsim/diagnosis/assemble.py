@@ -10,7 +10,7 @@ from mcsim.datavector.candidate import Candidate, columns_of, parts_of, scatters
 from mcsim.diagnosis.consistency import amplitudes
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.nuisance import NuisanceResult, Regression, results, with_priors
-from mcsim.diagnosis.refine import PartialExplanation, Refined
+from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import CandidateResult, DiagnosisResult, EffectResult, EffectSet
 from mcsim.diagnosis.selection import Explanation
 from mcsim.errors import InputError
@@ -43,7 +43,7 @@ def result_of(
         probability=found.probability,
         cosine=found.cosine,
         nearest_pvalue=found.singles[found.nearest].pvalue,
-        partial=() if partial is None else tuple(_partial(context, partial)),
+        partial=() if partial is None else tuple(_partial(context, refined)),
         partial_left=None if partial is None else partial.left,
         held_out=reduction,
         nuisances=tuple(_nuisances(data, refined)),
@@ -75,9 +75,11 @@ def result_of(
     )
 
 
-def _partial(context: DiagnosisContext, found: PartialExplanation) -> Iterator[EffectResult]:
+def _partial(context: DiagnosisContext, refined: Refined) -> Iterator[EffectResult]:
     """Return effects that do not explain all, with the priors of nuisances among them in their errors."""
-    members = [context.candidates[member] for member in found.members]
+    assert refined.partial is not None  # the caller has asked
+    found = refined.partial
+    members = [refined.candidates[member] for member in found.members]
     t = found.templates[:, columns_of(context.candidates, found.members)]
     return effects_of(context.candidates, found.members, with_priors(context.null, t, found.fit, members))
 

@@ -86,7 +86,7 @@ def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> At
     context, every = data.context, found.explanations
 
     def errors(one: Explanation, best: bool) -> Explanation:
-        members = [context.candidates[member] for member in one.members]
+        members = [refined.candidates[member] for member in one.members]
         t = refined.templates[:, columns_of(context.candidates, one.members)]
         scatters = scatters_of(refined.candidates, one.members)
         null = context.null.with_extra_covariance(*scatters)

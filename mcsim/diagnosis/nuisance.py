@@ -109,6 +109,8 @@ def with_nuisances(
     Such a candidate departs from the model only beyond its prior. Its template must therefore be the very direction in
     which the nuisance scatters the simulations; of a nuisance that the data hardly measure the regression is noise, and
     its scatter small beside that of the data: its prior goes into the error of its amplitude, by :func:`with_priors`.
+    Where the data depart along that direction by more than its prior explains, its response is simulated in their very
+    sky, like that of any other (:class:`~mcsim.diagnosis.refine.Refiner`), with the prior in the error, too.
     """
     assert ensemble.nuisances is not None  # the caller has asked
     drawn = ensemble.nuisances - ensemble.nuisances.mean(axis=0)
@@ -122,11 +124,9 @@ def with_nuisances(
             same = candidate.identity == (one.effect.name, one.channel) and not one.parameter_widths
             if not same or candidate.effect(**candidate.settings) != one.effect(**one.settings):
                 continue
-            if clear[own].all():
+            if measured := bool(clear[own].all()):
                 t[:, list(candidate.columns)] = response[own].T
-                found[place] = replace(candidate, nuisance=True)
-            else:
-                found[place] = replace(candidate, known=(response[own].T, one.sigma))
+            found[place] = replace(candidate, nuisance=measured, known=(response[own].T, one.sigma))
     return tuple(found), t
 
 
@@ -148,10 +148,13 @@ def with_priors(
     W r r' of it, r the response of the mean sky, which the weights evade where T differs from r, by noise or in the
     very sky of the data. A W r r' A' is taken from the covariance, and W added: measurement and prior.
     """
-    widths = np.concatenate([np.zeros(len(m.columns)) if m.known is None else m.known[1] for m in members])
+    # A template that is the scatter itself has the prior in its error already.
+    known = [None if m.nuisance else m.known for m in members]
+    sizes = [len(m.columns) for m in members]
+    widths = np.concatenate([np.zeros(k) if one is None else one[1] for one, k in zip(known, sizes, strict=True)])
     if not widths.any():
         return scattered(found)
-    parts = [np.zeros((len(t), len(m.columns))) if m.known is None else m.known[0] for m in members]
+    parts = [np.zeros((len(t), k)) if one is None else one[0] for one, k in zip(known, sizes, strict=True)]
     basis, back = orthonormal(null.whiten_templates(t))
     seen = back @ basis.T @ null.whiten_templates(np.concatenate(parts, axis=1) * widths)
     scale = (null.dof + found.chi2) / (found.dof - 2)

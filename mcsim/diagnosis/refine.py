@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy import special
 
 from mcsim.datavector.candidate import Candidate, columns_of, coordinates_of, effects_at, lost, parts_of, scatters_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
@@ -162,9 +163,12 @@ class Refiner:
         """
         candidate = now.candidates[index]
         columns, how, done = list(candidate.columns), candidate.parametrization, now.done.get(index)
-        if candidate.nuisance or self._has_settled(done, coordinates, covariance):
+        within = candidate.nuisance and not self._is_beyond_prior(now.linear[:, columns], len(now.candidates))
+        if within or self._has_settled(done, coordinates, covariance):
             return False
-        nonlinear = curved or how.nonlinear or self._is_nonlinear(columns, coordinates)
+        nonlinear = curved or how.nonlinear or candidate.nuisance or self._is_nonlinear(columns, coordinates)
+        # From here on its template is what it does to this very sky, and its prior a part of its error.
+        candidate = now.candidates[index] = replace(candidate, nuisance=False)
         stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
         if (stochastic or nonlinear) and done is not None:
             share = self._squared(now.linear[:, columns], now.t[:, columns], done)
@@ -320,6 +324,9 @@ class Refiner:
         for explanation in found.explanations[:2]:
             for part in parts_of(candidates, explanation.members, explanation.fit):
                 work.setdefault(part[0], part)
+        for index, single in enumerate(found.singles):
+            if candidates[index].nuisance:
+                work.setdefault(index, (index, single.amplitudes, single.covariance))
         if found.explanations and len(found.explanations[0].members) == 1:
             return list(work.values())
         # Single ones too: a strong effect has a nonlinear response, and a stochastic one scatters it, until only a
@@ -335,6 +342,15 @@ class Refiner:
                 if candidate.parametrization.stochastic:
                     stochastic.add(candidate.identity)
         return list(work.values())
+
+    def _is_beyond_prior(self, t: Matrix, candidates: int) -> bool:
+        """Return True if data depart along the templates of a nuisance, shape (p, k), by more than its prior explains.
+
+        What else is missing may leave much: chi^2 falls by what the covariance says, without a scale from what is left.
+        """
+        null = self.context.null
+        fall = null.hartlap_factor * null.fit(self.data.x, t).delta_chi2
+        return bool(candidates * special.chdtrc(t.shape[1], fall) <= self.context.settings.further_level)
 
     def _is_nonlinear(self, columns: list[int], coordinates: Vector) -> bool:
         """Return True if the second derivative matters at these coordinates."""

@@ -41,9 +41,9 @@ MODEL = two_channels("company", sigma0_uk=60.0) | {
 SIMULATIONS, SKIES = 400, 320
 
 
-def small_analysis(run):
-    settings = DiagnosisSettings(including=PROPOSED, scan_sims=60, beam_orders=2, response_modes=1 << 12)
-    return analysis_of(run, without=WITHOUT, settings=settings)
+def small_analysis(run, *more):
+    settings = DiagnosisSettings(including=(*PROPOSED, *more), scan_sims=60, beam_orders=2, response_modes=1 << 12)
+    return analysis_of(run, without=[name for name in WITHOUT if name not in more], settings=settings)
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +136,18 @@ def test_a_calibration_far_beyond_its_prior_is_named(run, declared):
     # Its error has the prior, which is part of the model, but for what 500 standard deviations change in the response.
     assert best.sigma > 0.5 * WIDTH
     assert best.amplitude == pytest.approx(10.0 * WIDTH, abs=4.0 * best.sigma)
+
+
+def test_a_calibration_far_beyond_its_prior_is_no_dipole_and_no_ring_of_the_beam(run):
+    # Its dipole changes products of residual and sky as this very sky has it, which no mean over skies shows.
+    analysis = small_analysis(run, "dipole_residual", "beam_sidelobe")
+    known = context(analysis, *campaign.learned(analysis, ask, SIMULATIONS, time_ordered=False))
+    for seed, amplitude in ((77, 7.0 * WIDTH), (78, 10.0 * WIDTH)):
+        found = diagnose_data(ObservedMaps(known, maps_of(run, calibration(amplitude), seed=seed), ask), "beyond")
+        assert [[(one.name, one.channel) for one in own.effects] for own in found.sets] == [[("calibration", "W1")]]
+        (best,) = found.effects
+        assert WIDTH < best.sigma < 1.3 * WIDTH  # its prior, and what the data leave
+        assert best.amplitude == pytest.approx(amplitude, abs=3.0 * best.sigma)
 
 
 def test_the_command_lists_and_writes_nuisances(run, mcsim, tmp_path, monkeypatch):
