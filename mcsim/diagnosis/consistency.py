@@ -69,6 +69,16 @@ class Findings:
         """Return the largest odds of no effect against one of the effects, in the data without one part."""
         return max((one.odds for own in self.comparisons for one in own), default=1.0)
 
+    @property
+    def bound(self) -> float:
+        """Return by which factor, at the least, the comparisons can make the set less probable; 1 if by none.
+
+        -e p ln p is the lower bound of the odds that a p-value leaves (Sellke, Bayarri & Berger, Am. Stat. 55, 62,
+        2001).
+        """
+        p = max(self.pvalue, 1e-300)
+        return min(-np.e * p * np.log(p) if p < np.exp(-1.0) else 1.0, 1.0 / max(self.odds, 1.0))
+
     def contradict(self, settings: DiagnosisSettings) -> bool:
         """Return True if parts of the data contradict one another, or most of them the effect."""
         return self.pvalue <= settings.consistency_level or self.odds >= settings.absence_odds

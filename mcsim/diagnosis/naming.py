@@ -1,12 +1,12 @@
 """Name only what agrees with all parts of the data, and what some part of them can measure by itself."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from mcsim.datavector.candidate import parts_of
+from mcsim.datavector.candidate import Candidate, parts_of
 from mcsim.diagnosis.consistency import Action, Slices, contradiction
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import is_drawn
@@ -21,12 +21,14 @@ def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[
 
     The effects of a set are simulated at their amplitudes, and these are compared in parts of the data. An effect whose
     pattern on the sky is drawn has no such response: it is told from other signals on the sky by its frequencies alone.
+    Where another set agrees, one that parts contradict is not left out before it is ``odds_cut`` times less probable.
     """
     context, slices = data.context, slices_of(data)
     settings, candidates = context.settings, context.candidates
     frequencies = {channel.frequency_ghz if channel.foregrounds else None for channel in context.run.channels}
     kept: list[Explanation] = []
     refused: list[Explanation] = []
+    doubted: list[tuple[Explanation, str]] = []
     sentences: list[str] = []
     for place, one in enumerate(found.explanations):
         members, why = [candidates[member] for member in one.members], ""
@@ -36,12 +38,35 @@ def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[
         elif place < settings.compared_sets:
             one = replace(one, findings=slices.findings(members, list(_actions(data, refined, one))))
             if one.findings.contradict(settings):
-                why = contradiction(one.findings, members, _effects(context, one), settings.consistency_level)
-        (refused if why else kept).append(one)
+                doubt = contradiction(one.findings, members, _effects(context, one), settings.consistency_level)
+                doubted.append((one, doubt))
+                continue
         if why:
-            best = " and ".join(candidate.title for candidate in members)
-            sentences.append(f"The data vector fits {best}, which is not named: {why}.")
+            refused.append(one)
+            sentences.append(f"The data vector fits {_title(candidates, one)}, which is not named: {why}.")
+        else:
+            kept.append(one)
+    agreed = tuple(kept)
+    for one, doubt in doubted:
+        left_out = not _is_as_probable(one, agreed, settings.odds_cut)
+        (refused if left_out else kept).append(replace(one, odds=one.odds * one.findings.bound))
+        named = "is not named" if left_out else "stays in the set, for it is hardly told from what all parts agree with"
+        sentences.append(f"The data vector fits {_title(candidates, one)}, which {named}: {doubt}.")
     return replace(found.of(kept), contradicted=tuple(refused)), sentences
+
+
+def _is_as_probable(one: Explanation, agreed: Sequence[Explanation], cut: float) -> bool:
+    """Return True if a set that parts of the data contradict cannot be told from one, as small, that agrees.
+
+    Two effects that look alike fit all of the data alike: then it is chance which of them a part contradicts.
+    """
+    least = max((other.odds for other in agreed), default=np.inf) / cut
+    fewest = min((len(other.members) for other in agreed), default=0)
+    return len(one.members) <= fewest and one.odds * one.findings.bound >= least
+
+
+def _title(candidates: Sequence[Candidate], one: Explanation) -> str:
+    return " and ".join(candidates[member].title for member in one.members)
 
 
 def slices_of(data: DataSet[Any]) -> Slices:

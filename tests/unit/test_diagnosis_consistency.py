@@ -14,7 +14,7 @@ from mcsim.datavector.candidate import BEYOND, Candidate
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element
-from mcsim.diagnosis.consistency import Action, Findings, Slices, contradiction
+from mcsim.diagnosis.consistency import Action, Comparison, Findings, MapCheck, Slices, contradiction
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
 
@@ -229,6 +229,17 @@ def test_more_noise_is_more_in_all_degrees_and_in_pixels():
     assert not refused(stripes, 5.0)
     # A part that shows half of it by chance is no sign that it is absent, if its power scatters as much more.
     assert not refused(np.array([0.0, 15.0, 10.0, 10.0, 0.0]), 4.0)
+
+
+@pytest.mark.parametrize("p", [0.2, 0.01, 1e-5])
+def test_a_pvalue_makes_a_set_less_probable_by_its_bound_at_most(p):
+    # p-values of an alternative that are a p^(a-1), 0 < a <= 1, are the more probable ones by 1/bound at most.
+    a = np.linspace(1e-4, 1.0, 100_000)
+    check = MapCheck(("W1",), 1.0, 1.0, 1.0, 1, p)
+    assert Findings(maps=(check,)).bound == pytest.approx(1.0 / np.max(a * p ** (a - 1.0)), rel=1e-6)
+    comparison = Comparison("halves", ("a", "b"), (1.0, 1.0), (1.0, 1.0), 1.0, odds=50.0)
+    assert Findings(((comparison,),)).bound == pytest.approx(0.02)
+    assert Findings().bound == 1.0
 
 
 def test_nothing_contradicts_an_effect_that_no_part_measures():

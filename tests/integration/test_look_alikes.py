@@ -1,0 +1,45 @@
+"""Two effects that look alike: what one part of the data says by chance names none of them."""
+
+import pytest
+
+from instruments import ask, data_of, two_channels
+from mcsim import config, systematics
+from mcsim.datavector import campaign
+from mcsim.datavector.analysis import analysis_of
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.diagnosis.context import context
+from mcsim.diagnosis.inference import diagnose_data
+from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.simulation import simulate
+
+PROPOSED = ("beam_sidelobe", "beam_ellipticity", "noise_level")
+
+
+@pytest.fixture(scope="module")
+def known():
+    run = config.load(two_channels("twins"))
+    without = [name for name in systematics.catalogue() if name not in PROPOSED]
+    analysis = analysis_of(run, without=without, settings=DiagnosisSettings(beam_orders=2))
+    return context(analysis, *campaign.learned(analysis, ask, 260, time_ordered=False))
+
+
+@pytest.mark.parametrize(("seed", "alone"), [(1024, False), (1029, False), (1008, True)])
+def test_a_ring_in_one_channel_is_not_called_the_opposite_ring_in_the_other_alone(known, seed, alone):
+    # With the first two seeds parts of the data contradict the ring that is there, by odds of 20 and p = 0.01.
+    data = data_of(known.run, "beam_sidelobe", "W1", seed=seed, amplitude=0.0018, calibrated="dipole")
+    found = diagnose_data(ObservedMaps(known, list(simulate.maps(data, 0)), ask), "twins")
+    names = {tuple((one.name, one.channel) for one in own.effects) for own in found.sets}
+    there, twin = (("beam_sidelobe", "W1"),), (("beam_sidelobe", "V1"),)
+    assert names == ({there} if alone else {there, twin})
+    refused = {tuple((one.name, one.channel) for one in own.effects) for own in found.contradicted}
+    assert refused == ({twin} if alone else set())
+    assert any("stays in the set" in note for note in found.notes) is not alone
+    best = min(found.sets, key=lambda own: own.effects[0].channel != "W1").effects[0]
+    assert best.amplitude == pytest.approx(0.0018, abs=3.0 * best.sigma)
+
+
+def test_a_set_that_no_other_agrees_beside_is_left_out_as_before(known):
+    data = data_of(known.run, "beam_sidelobe", "W1", seed=1020, amplitude=0.0018, calibrated="dipole")
+    found = diagnose_data(ObservedMaps(known, list(simulate.maps(data, 0)), ask), "alone")
+    assert found.kind == "unknown"
+    assert [one.effects[0].name for one in found.contradicted] == ["beam_sidelobe"]
