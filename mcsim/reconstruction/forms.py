@@ -26,7 +26,7 @@ from mcsim.sphere.sky import dipole_alm
 from mcsim.systematics.base import Alm, Draw, Effect, Map, Site
 from mcsim.systematics.parametrization import Parametrization, Vector
 from mcsim.systematics.product import multiplied
-from mcsim.systematics.sky import Boost
+from mcsim.systematics.sky import boosted
 from mcsim.systematics.spacecraft import axes, heading, line_of_sight, orientation, spin_phase
 
 REFERENCE_GHZ = 94.0
@@ -140,7 +140,7 @@ class RotatedSky(Form):
 
 @dataclass(frozen=True, kw_only=True)
 class BoostedSky(Form):
-    """The sky is seen by an observer with a velocity, in units of light's."""
+    """The sky is seen by an observer with a rapidity, which is the velocity in units of light's where that is small."""
 
     scope = "common"
     velocity: ClassVar[tuple[float, float, float]]
@@ -148,9 +148,8 @@ class BoostedSky(Form):
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         self.check_frame(site)
         x, y, z = self.velocity
-        lon_deg, lat_deg = np.rad2deg([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
         speed = self.amplitude * float(np.linalg.norm(self.velocity))
-        return Boost(amplitude=speed, lon_deg=lon_deg, lat_deg=lat_deg).sky(sky, site, draw)
+        return boosted(sky, site.lmax, speed, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x))
 
 
 @dataclass(frozen=True, kw_only=True)

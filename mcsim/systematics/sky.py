@@ -216,9 +216,14 @@ class Boost(DirectedEffect):
                 f"effect {self.name}: amplitude = {self.amplitude:g} is not slower than light; keep it within +-1."
             )
         colatitude, longitude = np.deg2rad([90.0 - self.lat_deg, self.lon_deg])
-        turned = ducc0.sht.rotate_alm(sky, site.lmax, -longitude, -colatitude, 0.0, nthreads=1)
-        boosted = expm_multiply(np.arctanh(self.amplitude) * _generator(site.lmax), turned, traceA=0.0)
-        return np.asarray(ducc0.sht.rotate_alm(boosted, site.lmax, 0.0, colatitude, longitude, nthreads=1))
+        return boosted(sky, site.lmax, np.arctanh(self.amplitude), colatitude, longitude)
+
+
+def boosted(sky: Alm, lmax: int, rapidity: float, colatitude: float, longitude: float) -> Alm:
+    """Return the a_lm of a sky in the frame of an observer who moves towards these angles, rad, with any rapidity."""
+    turned = ducc0.sht.rotate_alm(sky, lmax, -longitude, -colatitude, 0.0, nthreads=1)
+    moved = expm_multiply(rapidity * _generator(lmax), turned, traceA=0.0)
+    return np.asarray(ducc0.sht.rotate_alm(moved, lmax, 0.0, colatitude, longitude, nthreads=1))
 
 
 @lru_cache(maxsize=2)
