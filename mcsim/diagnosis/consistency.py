@@ -77,7 +77,7 @@ class Findings:
         2001).
         """
         p = max(self.pvalue, 1e-300)
-        return min(-np.e * p * np.log(p) if p < np.exp(-1.0) else 1.0, 1.0 / max(self.odds, 1.0))
+        return min(-p * np.log(p) * np.exp(1.0) if p < np.exp(-1.0) else 1.0, 1.0 / max(self.odds, 1.0))
 
     def contradict(self, settings: DiagnosisSettings) -> bool:
         """Return True if parts of the data contradict one another, or most of them the effect."""
