@@ -94,7 +94,9 @@ def _beam_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter | 
 def _gain_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
     """Correlate residuals with sky and dipole times the mean gain error of every pixel."""
     site, parts, lmax = model.survey.channels[channel].site, model.of(channel), max(model.lmax, 1)
-    errors = [gain_of(effect, site, Part.of(model.survey.config, n))[0].real for n in range(len(parts))]
+    # Of as many orders as the simulations need: one pass over the pointing for both.
+    orders, run = model.survey.channels[channel].beam.mmax, model.survey.config
+    errors = [gain_of(effect, site, Part.of(run, n), orders)[0].real for n in range(len(parts))]
     dipole = healpix.synthesis(dipole_alm(site.dipole_uk, lmax)[None], model.nside, lmax)[0]
 
     def value(filtered: FilteredMaps) -> float:

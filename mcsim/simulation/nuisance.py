@@ -14,7 +14,7 @@ from mcsim.config.messages import standing
 from mcsim.errors import InputError
 from mcsim.simulation import convolve
 from mcsim.simulation.channels import check_scope, site_of, table_of
-from mcsim.simulation.pixel_means import Part, gain_of, mean_gain, mean_signal, signal_of
+from mcsim.simulation.pixel_means import Part, gain_of, gain_of_all, mean_gain, mean_signal, signal_of
 from mcsim.simulation.survey import Channel, Survey, survey, with_effects
 from mcsim.sphere import rng
 from mcsim.support.arrays import Vector
@@ -264,7 +264,7 @@ class DisturbedSurvey:
             found[channel.name] = [
                 m.gain[:rows]
                 if m.gain is not None and len(m.gain) >= rows
-                else mean_gain(channel.effects, channel.site, Part.of(self.survey.config, place), rows - 2)
+                else gain_of_all(channel.effects, channel.site, Part.of(self.survey.config, place), rows - 2)
                 for place, m in enumerate(channel.maps)
             ]
         return found

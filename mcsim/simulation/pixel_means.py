@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,9 +19,14 @@ from mcsim.support import folders
 from mcsim.support.arrays import Map, divided
 from mcsim.support.code import class_digest, package_digest
 from mcsim.support.compiled import njit
-from mcsim.systematics import Effect, Pointing, Site, adding, spread_of
+from mcsim.systematics import Effect, Pointing, Site, adding, basis_of, spread_of
 
 _TIMES = 4096  #: at which a gain or a signal is evaluated for the key
+
+LINEAR = 1e-9  #: part of its largest gain or signal by which a linear effect may miss the sum of those of its basis
+ROUND_OFF = 1e-12  #: factor, relative to the largest, of an effect of the basis that is there only by round-off
+
+Terms = list[tuple[float, Effect]]  #: effects, each with a factor
 
 
 @dataclass(frozen=True)
@@ -127,16 +132,75 @@ def _add_weighted(pixel, value, theta, phi, psi, orders, sums):  # type: ignore[
 
 def gain_of(effect: Effect, site: Site, part: Part, orders: int = 0) -> NDArray[np.complex128]:
     """Return :func:`mean_gain` of one effect, kept on disk: each process of each diagnosis needs it."""
-    times = _times(effect, site, part)
     mean = partial(mean_gain, orders=orders)
-    return _kept(f"gain-{orders}", (effect, site, part), np.asarray(effect.gain(times, site)), mean)
+    return _kept(f"gain-{orders}", (effect, site, part), _gains(effect, site, part), mean)
 
 
 def signal_of(effect: Effect, site: Site, part: Part) -> Map:
     """Return the mean of what an effect adds to the samples of every pixel, uK, kept on disk too."""
+    return _kept("signal", (effect, site, part), _signals(effect, site, part), mean_signal)
+
+
+def gain_of_all(acting: tuple[Effect, ...], site: Site, part: Part, orders: int = 0) -> NDArray[np.complex128] | None:
+    """Return :func:`mean_gain`, of effects that are linear in their coordinates from those of their bases.
+
+    These are kept on disk: a diagnosis has the same effect at many amplitudes, and a pass can take minutes.
+    """
+    drifting = [effect for effect in acting if effect.gain(np.zeros(1), site) is not None]
+    linear, others = _along_bases(drifting, partial(_gains, site=site, part=part))
+    return _total(mean_gain(others, site, part, orders), linear, partial(gain_of, site=site, part=part, orders=orders))
+
+
+def signal_of_all(acting: tuple[Effect, ...], site: Site, part: Part) -> Map | None:
+    """Return :func:`mean_signal` in the same way, but where offsets shrink: signals are not linear there."""
+    if spread_of(acting) != 1.0:
+        return mean_signal(acting, site, part)
+    linear, others = _along_bases(adding(acting), partial(_signals, site=site, part=part))
+    return _total(mean_signal(others, site, part), linear, partial(signal_of, site=site, part=part))
+
+
+def _total(found: NDArray | None, terms: Terms, mean: Callable[[Effect], NDArray]) -> NDArray | None:
+    """Return the sum of what is ``found``, if anything, and of means times their factors."""
+    for factor, effect in terms:
+        own = factor * mean(effect)
+        found = own if found is None else found + own
+    return found
+
+
+def _along_bases(acting: Sequence[Effect], values: Callable[[Effect], Map]) -> tuple[Terms, tuple[Effect, ...]]:
+    """Return the effects of bases whose sum some effects are, by their values at some samples, and the others."""
+    terms, others = Terms(), []
+    for effect in acting:
+        own, wanted = _along_basis(effect), values(effect)
+        missed = wanted - np.sum([factor * values(one) for factor, one in own], axis=0)
+        if float(np.abs(missed).max()) <= LINEAR * float(np.abs(wanted).max()):
+            terms += own
+        else:
+            others.append(effect)
+    return terms, tuple(others)
+
+
+def _along_basis(effect: Effect) -> Terms:
+    """Return the effects of the basis, with the factors of which an effect is the sum if it is linear."""
+    fit = effect.parametrization
+    fitted = set().union(*fit.basis())
+    settings = {name: value for name, value in effect.parameters().items() if name not in fitted}
+    basis = basis_of(type(effect), settings)
+    factors = [float(c) / one.amplitude for c, one in zip(fit.coordinates(effect), basis, strict=True)]
+    largest = max(map(abs, factors))
+    return [(factor, one) for factor, one in zip(factors, basis, strict=True) if abs(factor) > ROUND_OFF * largest]
+
+
+def _gains(effect: Effect, site: Site, part: Part) -> Map:
+    """Return the error of the gain at some times."""
+    return np.asarray(effect.gain(_times(effect, site, part), site))
+
+
+def _signals(effect: Effect, site: Site, part: Part) -> Map:
+    """Return what an effect adds to some samples, uK."""
     times, turns = _times(effect, site, part), np.linspace(0.0, 1.0, _TIMES)
     angles = np.pi * turns, 2.0 * np.pi * (7.0 * turns % 1.0), 2.0 * np.pi * (31.0 * turns % 1.0)
-    return _kept("signal", (effect, site, part), effect.signal(times, *angles, site), mean_signal)
+    return effect.signal(times, *angles, site)
 
 
 def _times(effect: Effect, site: Site, part: Part) -> Map:

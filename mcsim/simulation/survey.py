@@ -27,7 +27,7 @@ from mcsim.simulation.channels import (
 )
 from mcsim.simulation.filtering import Filtering, Progress
 from mcsim.simulation.noise import DrawnNoise, of_map
-from mcsim.simulation.pixel_means import Part, mean_gain, mean_signal
+from mcsim.simulation.pixel_means import Part, gain_of_all, signal_of_all
 from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
 from mcsim.simulation.survey_filter import filtering_of
@@ -252,7 +252,7 @@ def _channel(
             m = replace(m, noise_uk=mapmaking.level_uk(pairs, _sigma0_uk(spec)))
         m = with_effects(m, acting, site)
         part = Part.of(run, index)
-        gain, signal_uk = mean_gain(acting, site, part, beam.mmax), mean_signal(acting, site, part)
+        gain, signal_uk = gain_of_all(acting, site, part, beam.mmax), signal_of_all(acting, site, part)
         maps.append(replace(m, gain=gain, signal_uk=signal_uk))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
     spread = spread_of(acting)

@@ -1,10 +1,12 @@
 """What scores are made of, and that it is made once."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import healpy
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from mcsim import bipolar, config, systematics
 from mcsim.datavector.analysis import analysis_of
@@ -22,20 +24,23 @@ from mcsim.sphere.rotation import FRAMES
 HALVES = (Part((0.0, 0.5)), Part((0.5, 1.0)))
 
 
-@pytest.mark.slow
-def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def site() -> systematics.Site:
     model = replace(ScanModel.load("wmap"), sample_period_s=61.0, duration_days=365.0)
-    line = model.line_of_sight("A")
-    site = systematics.Site(
+    return systematics.Site(
         channel="W1",
         frequency_ghz=94.0,
         frame="ecliptic",
         nside=8,
         lmax=8,
         beam=Beam.elliptical(330.0, 300.0, angle_deg=20.0, lmax=8),
-        pointing=systematics.Pointing(model, replace(line, sample_period_s=None)),
+        pointing=systematics.Pointing(model, replace(model.line_of_sight("A"), sample_period_s=None)),
         dipole_uk=np.zeros(3),
     )
+
+
+@pytest.mark.slow
+def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch, site: systematics.Site) -> None:
     drifts = [systematics.get("gain_drift")(amplitude=0.01, phase_deg=phase) for phase in (0.0, 90.0)]
     passes = []
     monkeypatch.setattr(pixel_means, "mean_gain", lambda *args, **how: passes.append(args) or mean_gain(*args, **how))
@@ -48,6 +53,42 @@ def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch) -> No
     first, second = (pixel_means.gain_of(drifts[1], site, half)[0].real.mean() for half in HALVES)
     assert first == pytest.approx(0.01 * 2 / np.pi, rel=0.1)
     assert second == pytest.approx(-first, rel=0.1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SaturatedDrift(systematics.Effect):
+    """A gain that is not linear in its amplitude."""
+
+    name = "saturated_drift"
+    scope = "channel"
+    unit = "fraction"
+    cause = signature = source = "none"
+    step = 1e-3
+
+    def gain(self, time_s: NDArray[np.float64], site: systematics.Site) -> NDArray[np.float64] | None:
+        return np.tanh(300.0 * self.amplitude * np.cos(2.0 * np.pi * time_s / 3.15e7)) if self.amplitude else None
+
+
+@pytest.mark.slow
+def test_drifts_of_all_amplitudes_take_two_passes(monkeypatch: pytest.MonkeyPatch, site: systematics.Site) -> None:
+    """One for each phase that spans the others; a gain that is not linear takes one of its own."""
+    passes = []
+
+    def one_pass(acting: tuple[systematics.Effect, ...], *args: Any, **how: Any) -> NDArray[np.complex128] | None:
+        passes.extend(acting)
+        return mean_gain(acting, *args, **how)
+
+    monkeypatch.setattr(pixel_means, "mean_gain", one_pass)
+    drift = systematics.get("gain_drift")
+    for amplitude, phase_deg in ((0.01, 0.0), (-0.01, 0.0), (0.01, 90.0), (0.02, 30.0), (3e-4, 222.0)):
+        effect = drift(amplitude=amplitude, phase_deg=phase_deg)
+        found = pixel_means.gain_of_all((effect,), site, HALVES[0], 2)
+        np.testing.assert_allclose(found, mean_gain((effect,), site, HALVES[0], 2), rtol=0.0, atol=1e-14)
+    assert len(passes) == 2
+    bent = SaturatedDrift(amplitude=4e-3)
+    found = pixel_means.gain_of_all((effect, bent), site, HALVES[0], 2)
+    np.testing.assert_allclose(found, mean_gain((effect, bent), site, HALVES[0], 2), rtol=0.0, atol=1e-12)
+    assert passes[2:] == [bent]
 
 
 def test_channels_of_one_beam_are_filtered_as_each_by_itself() -> None:
