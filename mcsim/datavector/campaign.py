@@ -1,7 +1,7 @@
 """Plan and run the simulations that a diagnosis needs, and turn them into a null ensemble and templates."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cache
@@ -19,11 +19,13 @@ from mcsim.datavector.kept import Kept
 from mcsim.datavector.null_ensemble import NullEnsemble, without_nuisances
 from mcsim.datavector.repeats import check_distinct
 from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.summaries import pair_classes
 from mcsim.ensemble import runner
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
 from mcsim.simulation.nuisance import draws
 from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.stats.shrinkage import shrunk
 from mcsim.support.progress import reporting
 from mcsim.systematics import Effect
 
@@ -33,6 +35,17 @@ Ask = Callable[[Sequence[Job]], list[Rows]]  #: return the results of jobs, in o
 
 Batch = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]]
 """Call a function with tuples of arguments; yield (index, result) in the order of completion."""
+
+MODES = 1 << 16
+"""Modes of the sky that maps show, up to which responses are averaged over the least numbers of skies that settings
+have; of more modes over fewer, as each sky tells as much more."""
+
+LOOKED_AT = 500
+"""Simulations from which on it is measured what their covariance is worth: of fewer the number scatters too much."""
+
+LEAST, STEP = 1.25, 0.25  #: simulations per element at the first look, and between two
+
+FEWEST = 2  #: skies over which any response is averaged: their scatter is its error
 
 PER_TASK = 10
 _CONSTRAINED_PER_TASK = 4
@@ -82,6 +95,8 @@ def asking(
                 for job, known in zip(jobs, held, strict=True)
                 for piece in ([job] if kept is None else kept.missing(job, known))
             ]
+            # Jobs of the same skies follow each other: what no effect changes is then made once for all of them.
+            pieces.sort(key=lambda pair: pair[1].first)
             total = sum(job.count for job in jobs)
             report.expect(float(total))
             done += total - sum(piece.count for _, piece in pieces)
@@ -192,7 +207,10 @@ def skies(analysis: Analysis, candidate: Candidate, sign: int = 1) -> int:
     fewest = settings.channel_skies
     if candidate.channel is None:
         fewest = settings.typical_skies if candidate.parametrization.mean_response else settings.common_skies
-    count = min(max(fewest, -(-settings.response_modes // analysis.model.lmax**2)), settings.noisy_skies)
+    model = analysis.model
+    shown = float((2.0 * np.arange(model.lmax + 1) + 1.0) @ model.sky_power)
+    fewest = max(FEWEST, math.ceil(fewest * min(1.0, MODES / shown)))
+    count = min(max(fewest, -(-settings.response_modes // model.lmax**2)), settings.noisy_skies)
     opposite = sign < 0 and candidate.parametrization.sign == 0
     return math.ceil(settings.opposite_share * count) if opposite else count
 
@@ -285,18 +303,37 @@ def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool
         return run(list(jobs))
     size, settings = len(analysis.elements), analysis.settings
     few, source = settings.pilot_sims_per_element * size, analysis.source
+    stored = None if source is None else source.count
+    if settings.shrinks(None) and stored is None:
+        few = min(few, max(LOOKED_AT, math.ceil(LEAST * size)))
     # What is needed in any case keeps workers busy to the end of the pilot; external simulations wait for its verdict.
-    first = run([one for one in jobs if (one.number < few if one.kind == "null" else source is None)])
-    drawn = np.concatenate([result[:, :size] for purpose, result in first.items() if purpose.kind == "null"])
+    found = run([one for one in jobs if (one.number < few if one.kind == "null" else source is None)])
+    drawn = _drawn(found, size)
     if source is not None:
         check_distinct(drawn, source, _COVARIANCE)
     quiet = without_nuisances(drawn, _nuisances(analysis, len(drawn)))
     independent = SimulatedGaussian.from_simulations(quiet, floor=settings.redundant).dimension
     enough = _needed(settings, independent)
-    if source is not None and source.count is not None and source.count < settings.sims_per_element * independent:
+    if source is not None and stored is not None and stored < settings.sims_per_element * independent:
         raise _too_few(source, independent, settings.sims_per_element)
-    found = first | run([one for one in jobs if one not in first and (one.kind != "null" or one.number < enough)])
+    if settings.shrinks(None) and stored is None:
+        while LOOKED_AT <= few < enough and _worth(analysis, drawn) < settings.worth_per_element * independent:
+            few += math.ceil(STEP * independent)
+            found |= run([one for one in jobs if one not in found and one.kind == "null" and one.number < few])
+            drawn = _drawn(found, size)
+        enough = min(few, enough) if few >= LOOKED_AT else enough
+    found |= run([one for one in jobs if one not in found and (one.kind != "null" or one.number < enough)])
     return {purpose: found[purpose] for purpose in jobs if purpose in found}
+
+
+def _drawn(found: Mapping[Purpose, Rows], size: int) -> Rows:
+    """Return the data vectors of simulations of the model, shape (N, p)."""
+    return np.concatenate([result[:, :size] for purpose, result in found.items() if purpose.kind == "null"])
+
+
+def _worth(analysis: Analysis, drawn: Rows) -> int:
+    """Return how many simulations of a sample covariance the shrunk one of some is worth."""
+    return shrunk(drawn, analysis.settings.redundant, pair_classes(analysis.elements)).dof
 
 
 def _needed(settings: DiagnosisSettings, elements: int) -> int:

@@ -86,6 +86,9 @@ class DiagnosisSettings:
     sims_per_element, pilot_sims_per_element
         Simulations per independent element of the data vector, at least ``scan_sims`` in all; and per element, after
         which these are counted.
+    worth_per_element
+        Simulations of a sample covariance per independent element that a shrunk one must be worth: from 500 on it is
+        looked at after every quarter per element, and no more are made.
     shrunk
         Shrink the covariance (:func:`mcsim.stats.shrinkage.shrunk`), unless ``simulations`` is given. That of a sample
         needs 10 per element.
@@ -207,6 +210,7 @@ class DiagnosisSettings:
 
     sims_per_element: int = 3
     pilot_sims_per_element: int = 2
+    worth_per_element: float = 10.0
     shrunk: bool = True
     redundant: float = 1e-4
     response_modes: int = 1 << 14
@@ -259,7 +263,7 @@ class DiagnosisSettings:
         """Raise InputError for settings of another kind, negative numbers, levels above 1, and counts too small."""
         levels = [field.name for field in fields(self) if field.name.endswith(("_level", "_pvalue", "_share"))]
         skies = ("channel_skies", "typical_skies", "common_skies", "noisy_skies", "table_skies")
-        sims = ("sims_per_element", "pilot_sims_per_element")
+        sims = ("sims_per_element", "pilot_sims_per_element", "worth_per_element")
         least: dict[str, float] = dict.fromkeys((*skies, *sims, "constrained_skies"), 2)
         one = ("max_effects", "odds_cut", "beam_orders", "beam_bins", "sky_bins", "scan_bins", "scan_L_max")
         least |= dict.fromkeys((*one, "filter_iterations"), 1)

@@ -10,6 +10,7 @@ from mcsim.simulation.survey import Survey
 from mcsim.support.arrays import Alm, Map
 
 MEMORY = 1 << 27  #: bytes of maps that a process keeps, beyond which the oldest go
+REALIZATIONS = 2  #: whose maps a process keeps, however large they are: those of a piece of a job at any resolution
 
 
 class UntouchedMaps:
@@ -38,7 +39,7 @@ class UntouchedMaps:
                 self._kept[key] = own
                 self._bytes += _size(own)
             found += own
-        while self._bytes > MEMORY:
+        while self._bytes > max(MEMORY, REALIZATIONS * _size(found)):
             self._bytes -= _size(self._kept.pop(next(iter(self._kept))))
         return found
 

@@ -44,9 +44,11 @@ def test_maps_without_an_effect_are_made_once_for_all_effects(monkeypatch: pytes
         made.clear()
 
 
-def test_no_more_maps_are_kept_than_the_memory_holds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(untouched_maps, "MEMORY", 3 * 8 * 12 * 8**2)
+@pytest.mark.parametrize(("maps", "expected"), [(5, 5), (1, 4)])
+def test_no_more_maps_are_kept_than_the_memory_holds(monkeypatch: pytest.MonkeyPatch, maps: int, expected: int) -> None:
+    """But those of two realizations, which the next effects need."""
+    monkeypatch.setattr(untouched_maps, "MEMORY", maps * 8 * 12 * 8**2)
     kept, own = UntouchedMaps(), survey(run({"name": "beam_width", "channel": "W1", "amplitude": 0.1}))
-    for realization in range(5):
+    for realization in range(7):
         kept.maps(own, realization, None, "")
-    assert len(kept._kept) == 3
+    assert len(kept._kept) == expected

@@ -1,0 +1,67 @@
+"""How many simulations of a model, and skies of a response, are made."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mcsim import config
+from mcsim.datavector import campaign
+from mcsim.datavector.analysis import Analysis, Job, analysis_of
+from mcsim.datavector.settings import DiagnosisSettings
+
+
+@pytest.fixture(scope="module")
+def four() -> Analysis:
+    channels = [
+        {
+            "name": f"W{number}",
+            "beam": {"kind": "gaussian", "fwhm_arcmin": 900.0},
+            "noise": {"sigma0_uk": 50.0},
+            "scan": {"kind": "parallel_transport", "psi0_deg": 20.0},
+        }
+        for number in range(4)
+    ]
+    sections = {"sky": {"spectrum": "wmap7", "lmax": 16}, "map": {"nside": 8, "splits": ["half1", "half2"]}}
+    run = config.load({"schema": 1, "name": "four", "channel": channels, "ensemble": {"seed": 3}, **sections})
+    return analysis_of(run, settings=DiagnosisSettings(redundant=1e-12))
+
+
+def counted(analysis: Analysis, draw: Callable[[int], NDArray[np.float64]]) -> int:
+    """Return how many simulations of the model are asked for, one after the other, if they are drawn like this."""
+    asked = []
+
+    def ask(jobs: Sequence[Job]) -> list[NDArray[np.float64]]:
+        asked.extend(job.first for job in jobs if campaign.is_of_the_model(job))
+        return [draw(job.count) for job in jobs]
+
+    found = campaign._results(analysis, campaign.plan(analysis, time_ordered=False), ask, True)
+    assert sorted(asked) == list(range(0, 10 * len(asked), campaign.PER_TASK))
+    return sum(len(rows) for purpose, rows in found.items() if purpose.kind == "null")
+
+
+def test_simulations_end_when_their_covariance_is_worth_enough(four: Analysis) -> None:
+    """Of elements that are not correlated few tell it; of those that all are, three for each element are made."""
+    size, rng = len(four.elements), np.random.default_rng(5)
+    assert 2 * size > campaign.LOOKED_AT  # before the end of the pilot
+    mixed = rng.standard_normal((size, size))
+    few = counted(four, lambda count: rng.standard_normal((count, size)))
+    assert few == campaign.LOOKED_AT
+    many = counted(four, lambda count: rng.standard_normal((count, size)) @ mixed)
+    assert many - 3 * size in range(campaign.PER_TASK)
+
+
+def test_skies_of_many_modes_tell_as_much_in_fewer(four: Analysis) -> None:
+    """Twice the modes, half of the skies, down to two, with the opposite step in a third of them."""
+    one = next(each for each in four.candidates if each.name == "dipole_modulation")
+    model = four.model
+    assert campaign.skies(four, one) == 24  # of a sky with few modes
+    for modes, expected in ((1, 12), (2, 6), (3, 4), (40, 2)):
+        lmax = 2 * model.lmax
+        power = np.full(lmax + 1, 0.999 * modes * campaign.MODES / (lmax + 1) ** 2)
+        settings = replace(model.settings, response_modes=1)
+        own = replace(four, model=replace(model, lmax=lmax, sky_power=power, settings=settings))
+        assert campaign.skies(own, one) == expected
+        assert campaign.skies(own, one, -1) == -(-expected // 3)
