@@ -17,13 +17,14 @@ each order gives that of every beam.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cache, cached_property, reduce
 
 import healpy
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.bipolar import by_degree
+from mcsim.datavector import pixel_noise
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.instrument.scan import Moments
@@ -35,7 +36,6 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Alm, Cl, Map, divided
-from mcsim.support.compiled import njit
 
 FAINT = 0.1
 """Power of the sky over that of the noise at the last degree of the filters; what is above adds below 1 % to sigmas."""
@@ -46,6 +46,9 @@ SHARP = 30.0
 preconditioner has no such sharp end (:class:`mcsim.simulation.preconditioner.Preconditioner`)."""
 
 EXACT = 0.1  #: filter_tolerance of the exact filter
+
+TAIL = 1e-3  #: part of the squared S/N of a change of a beam that is left beyond the last degree of its order
+SAVED = 0.1  #: least part of a transform that an earlier last degree must save
 
 LEFT = 0.01  #: share of what was subtracted from maps that stays in :meth:`Part.without_response`
 RANK = 1e-10  #: smallest eigenvalue over the largest of templates that are fitted and subtracted
@@ -125,6 +128,21 @@ class Model:
         return divided(1.0, self.cl)
 
     @cached_property
+    def last_degrees(self) -> NDArray[np.int64]:
+        """Return the last degree at which orders s of each channel's beam are measured, (channel, beam_orders + 1).
+
+        Beyond it there is less than TAIL of the squared S/N of a change of B_l by (l / lmax)^s: the sky is below the
+        noise there, or the beam has taken it away. It is lmax where an earlier end would save little.
+        """
+        ell = np.arange(self.lmax + 1.0)
+        powers = (ell / max(self.lmax, 1)) ** (2 * np.arange(self.settings.beam_orders + 1.0)[:, None])
+        squared = (2.0 * ell + 1.0) * self.cl * self.sky_power * self.response[:, None] ** 2 * powers
+        beyond = np.cumsum(squared[..., ::-1], axis=-1)[..., ::-1]
+        last = np.sum(beyond >= TAIL * beyond[..., :1], axis=-1) - 1
+        little = (last + 1.0) ** 2 > (1.0 - SAVED) * (self.lmax + 1.0) ** 2
+        return np.where(little, self.lmax, last)
+
+    @cached_property
     def alike(self) -> tuple[tuple[Cl, tuple[int, ...]], ...]:
         """Return the different responses, each with the indices of all maps that have it."""
         rows, which = np.unique(self.response, axis=0, return_inverse=True)
@@ -193,8 +211,8 @@ class FilteredMaps:
     # D_s(l) of every map, (map, beam_orders + 1, lmax + 1); s = 0 is real. The sky in it has the dipole. Above
     # split_beam_orders the channel's sum stands in its first map.
     orders: NDArray[np.complex128]
-    difference: NDArray[np.float64]  # u^2 - 1 of every pixel, (channel, npix): _normalised_difference
-    squares: NDArray[np.float64]  # N_i r_i^2 summed over maps, (channel, npix): _squares
+    difference: NDArray[np.float64]  # u^2 - 1 of every pixel, (channel, npix): pixel_noise.fill_difference
+    squares: NDArray[np.float64]  # N_i r_i^2 summed over maps, (channel, npix): pixel_noise.add_squares
 
 
 def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
@@ -301,6 +319,8 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
     looked_at = sky + model.dipole
     expected = _expected(model, clean, sky)
     residual, adjoint = np.empty_like(expected), np.empty((len(model.parts), sky.size), dtype=np.complex128)
+    up_to = cache(lambda last: alm_.resize(looked_at, lmax, last))
+    scratch = np.empty((2, expected.shape[1]))
     orders = np.zeros((len(model.parts), top + 1, lmax + 1), dtype=np.complex128)
     k = np.sqrt(4 * np.pi / (2 * np.arange(lmax + 1) + 1))
     for channel in range(len(model.channels)):
@@ -308,18 +328,23 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
         window = model.survey.channels[channel].window[: lmax + 1]
         for i in members:
             part = model.parts[i]
-            residual[i] = part.without_response(np.where(seen[i], part.precision * (clean[i] - expected[i]), 0.0))
+            pixel_noise.weigh(clean[i], expected[i], np.where(seen[i], part.precision, 0.0), residual[i])
+            if part.subtracted:
+                residual[i] = part.without_response(residual[i])
             adjoint[i] = healpix.adjoint(residual[i], lmax)
             orders[i, 0] = window * k * by_degree(looked_at, adjoint[i], lmax)
         for i, s, together in _transforms(model, members):
-            turned = convolve.turned([(residual[j], model.parts[j].moments) for j in together], s)
-            electric, magnetic = healpix.adjoint(turned, lmax, spin=s)
+            last = int(model.last_degrees[channel, s])
+            turned = convolve.turned([(residual[j], model.parts[j].moments) for j in together], s, scratch)
+            electric, magnetic = healpix.adjoint(turned, last, spin=s)
             # ducc0's sign: S_s is minus the synthesis of E = Re(k b) a, B = Im(k b) a.
-            both = by_degree(looked_at, electric, lmax) + 1j * by_degree(looked_at, magnetic, lmax)
-            orders[i, s] = -2.0 * window * k * both
-    groups = [model.of(channel) for channel in range(len(model.channels))]
-    difference = np.stack([_normalised_difference(model, residual, alike) for alike in groups])
-    squares = np.stack([_squares(model, residual, alike) for alike in groups])
+            both = by_degree(up_to(last), electric, last) + 1j * by_degree(up_to(last), magnetic, last)
+            orders[i, s, : last + 1] = -2.0 * (window * k)[: last + 1] * both
+    difference, squares = np.zeros((2, len(model.channels), expected.shape[1]))
+    for channel in range(len(model.channels)):
+        own = [(residual[i], model.parts[i].precision) for i in model.of(channel)]
+        pixel_noise.fill_difference(own, difference[channel])
+        pixel_noise.add_squares(own, squares[channel])
     return FilteredMaps(sky, expected, residual, adjoint, orders, difference, squares)
 
 
@@ -349,44 +374,6 @@ def _summed(model: Model, maps: Sequence[Map]) -> tuple[Map, Map]:
     """Return the sum of maps over their noise variances, and of one over these, shape (npix,) both."""
     precision = [part.precision for part in model.parts]
     return np.sum([one * map_ for one, map_ in zip(precision, maps, strict=True)], axis=0), np.sum(precision, axis=0)
-
-
-def _normalised_difference(model: Model, residual: NDArray[np.float64], parts: tuple[int, ...]) -> Map:
-    """Return u^2 - 1 of every pixel seen by a channel's first two maps, u their difference over its noise; else 0.
-
-    Of a channel with one map, u is its residual over the noise.
-    """
-    # Residuals are zero where nothing was seen, and come times their precision: (r/a - s/b)^2 / (1/a + 1/b).
-    first, a = residual[parts[0]], model.parts[parts[0]].precision
-    if len(parts) == 1:
-        seen = first != 0.0
-        return np.asarray(divided(first**2, np.where(seen, a, 0.0)) - seen)
-    found = np.zeros_like(first)
-    _difference(first, a, residual[parts[1]], model.parts[parts[1]].precision, found)
-    return found
-
-
-@njit(nogil=True)
-def _difference(first, a, second, b, found):  # type: ignore[no-untyped-def]
-    """Fill ``found`` where both are seen, in one pass over memory."""
-    for pixel in range(found.size):
-        if first[pixel] != 0.0 and second[pixel] != 0.0:
-            square = (first[pixel] * b[pixel] - second[pixel] * a[pixel]) ** 2
-            found[pixel] = square / (a[pixel] * b[pixel] * (a[pixel] + b[pixel])) - 1.0
-
-
-def _squares(model: Model, residual: NDArray[np.float64], parts: tuple[int, ...]) -> Map:
-    """Return N_i r_i^2 of every pixel, summed over maps: twice the derivative of ln L in ln N, but for a constant.
-
-    All modes take part that know of the noise: those of the difference of splits, and those of their sum that the sky
-    does not fill. A pixel that the data lack counts like the map's mean.
-    """
-    total = np.zeros(residual.shape[1])
-    for i in parts:
-        precision, seen = model.parts[i].precision, residual[i] != 0.0
-        square = divided(residual[i] ** 2, precision)
-        total += np.where(seen, square, square.sum() / max(np.count_nonzero(seen), 1) * (precision > 0.0))
-    return total
 
 
 def shared_sky(model: Model, maps: Sequence[Map]) -> Alm:

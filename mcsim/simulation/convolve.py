@@ -139,9 +139,14 @@ def add_twice_real_part(w, real, imag, total):  # type: ignore[no-untyped-def]
         total[pixel] += 2.0 * (w[pixel].real * real[pixel] - w[pixel].imag * imag[pixel])
 
 
-def turned(each: Sequence[tuple[Map, Moments]], s: int) -> NDArray[np.float64]:
-    """Return the sum of conj(w_s) times maps, real and imaginary part, shape (2, npix): adjoint to w_s S_s."""
-    total = np.empty((2, each[0][0].size))
+def turned(
+    each: Sequence[tuple[Map, Moments]], s: int, total: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """Return the sum of conj(w_s) times maps, real and imaginary part, shape (2, npix): adjoint to w_s S_s.
+
+    ``total``: an array of this shape to fill, in place of a new one.
+    """
+    total = np.empty((2, each[0][0].size)) if total is None else total
     for place, (map_, moments) in enumerate(each):
         check_shape(map_, (moments.npix,), f"the map beside moments of nside {moments.nside}")
         _turn(map_, moments.w[s - 1], total, place == 0)

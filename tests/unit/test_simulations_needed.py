@@ -60,7 +60,7 @@ def test_skies_of_many_modes_tell_as_much_in_fewer(four: Analysis) -> None:
     assert campaign.skies(four, one) == 24  # of a sky with few modes
     for modes, expected in ((1, 12), (2, 6), (3, 4), (40, 2)):
         lmax = 2 * model.lmax
-        power = np.full(lmax + 1, 0.999 * modes * campaign.MODES / (lmax + 1) ** 2)
+        power = np.full(lmax + 1, 1.001 * modes * campaign.MODES / (lmax + 1) ** 2)
         settings = replace(model.settings, response_modes=1)
         own = replace(four, model=replace(model, lmax=lmax, sky_power=power, settings=settings))
         assert campaign.skies(own, one) == expected

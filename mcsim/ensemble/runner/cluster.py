@@ -48,9 +48,9 @@ ANSWER_S = 5.0  #: time in which the scheduler at an address answers
 TURN_S = 30.0
 ALONE_S = 300.0  #: time that a run waits for a worker if all are lost
 
-_KEPT_MEMORY = {f"MALLOC_{limit}_THRESHOLD_": str(2**28) for limit in ("TRIM", "MMAP")}
+_KEPT_MEMORY = {f"MALLOC_{limit}_THRESHOLD_": str(2**30) for limit in ("TRIM", "MMAP")}
 """For glibc, in bytes. A worker makes maps of the same size repeatedly. distributed's default returns their memory to
-the system each time, and new pages cost nearly as much as the transforms."""
+the system each time, and new pages cost nearly as much as the transforms. More than a gigabyte is not kept."""
 
 QUIET = {
     "distributed.admin.large-graph-warning-threshold": "1 GB",  # data of a challenge go with its tasks
