@@ -1,9 +1,8 @@
 """What effects do to the samples of a survey, as means over the samples of every pixel."""
 
 import hashlib
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -14,12 +13,14 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.instrument.scan import MapGrid, scan_key
+from mcsim.instrument.scan.accumulate import add_weighted_samples
+from mcsim.instrument.scan.pointing import PointingStream
 from mcsim.simulation import tod
 from mcsim.support import folders
 from mcsim.support.arrays import Map, divided
 from mcsim.support.code import class_digest, package_digest
 from mcsim.support.compiled import njit
-from mcsim.systematics import Effect, Pointing, Site, adding, basis_of, spread_of
+from mcsim.systematics import Effect, Site, adding, basis_of, spread_of
 
 _TIMES = 4096  #: at which a gain or a signal is evaluated for the key
 
@@ -53,11 +54,19 @@ def mean_gain(acting: tuple[Effect, ...], site: Site, part: Part, orders: int = 
     if not drifting:
         return None
 
-    def add(chunk: tod.Samples, sums: NDArray[np.float64]) -> None:
-        terms = (g for effect in drifting if (g := effect.gain(chunk.time_s, site)) is not None)
-        _add_weighted(chunk.pixel, sum(terms, start=chunk.signal_uk), chunk.theta, chunk.phi, chunk.psi, orders, sums)
-
-    means = _means(add, 4 + 2 * orders, site.pointed(drifting[0].name), site, part)
+    pointing = site.pointed(drifting[0].name)
+    model, line, grid = pointing.model, pointing.line, MapGrid(site.nside, site.frame, part.share)
+    stream, period = PointingStream(model, line, grid.frame), model.period_of_samples(line)
+    own, whole = np.zeros((2, grid.npix, 5 + 2 * orders))
+    for low, high in tod.chunks(*grid.sample_range(model, line)):
+        time_s = period * np.arange(low, high, dtype=np.float64)
+        terms = (np.asarray(g) for effect in drifting if (g := effect.gain(time_s, site)) is not None)
+        gain = sum(terms, start=np.zeros(time_s.size))
+        add_weighted_samples(stream.at(low), grid.nside, orders, gain, np.ones(time_s.size, dtype=np.bool_), whole)
+        if part.rings is not None:
+            chosen = tod.on_rings(time_s, model.spin_period_s, *part.rings)
+            add_weighted_samples(stream.at(low), grid.nside, orders, gain, chosen, own)
+    means = _means(own, whole)
     theta, phi = healpy.pix2ang(site.nside, np.arange(means.shape[1]))
     x, y, z = means[1:4]
     found = np.empty((orders + 2, means.shape[1]), dtype=np.complex128)
@@ -77,28 +86,25 @@ def mean_signal(acting: tuple[Effect, ...], site: Site, part: Part) -> Map | Non
     if not found:
         return None
 
-    def add(chunk: tod.Samples, sums: NDArray[np.float64]) -> None:
+    pointing = site.pointed(found[0].name)
+    grid = MapGrid(site.nside, site.frame, part.share)
+    own, whole = np.zeros((2, grid.npix, 2))
+    for chunk in tod.samples(pointing.model, pointing.line, grid):
         chunk = tod.shrunk(chunk, site.nside, spread)
         terms = (effect.signal(chunk.time_s, chunk.theta, chunk.phi, chunk.psi, site) for effect in found)
-        _add(chunk.pixel, sum(terms, start=chunk.signal_uk), sums)
-
-    return np.ascontiguousarray(_means(add, 1, site.pointed(found[0].name), site, part)[0])
-
-
-def _means(
-    add: Callable[[tod.Samples, NDArray[np.float64]], None], number: int, pointing: Pointing, site: Site, part: Part
-) -> NDArray[np.float64]:
-    """Return means over the samples of every pixel, shape (number, npix), zero in pixels without any.
-
-    ``add`` adds samples to hits and as many sums, shape (npix, 1 + number).
-    """
-    grid = MapGrid(site.nside, site.frame, part.share)
-    own, whole = np.zeros((2, grid.npix, 1 + number))
-    for chunk in tod.samples(pointing.model, pointing.line, grid):
-        add(chunk, whole)
+        chunk = replace(chunk, signal_uk=sum(terms, start=chunk.signal_uk))
+        _add(chunk.pixel, chunk.signal_uk, whole)
         if part.rings is not None:
             for ring in tod.every_ring(pointing.model.spin_period_s, *part.rings)([chunk]):
-                add(ring, own)
+                _add(ring.pixel, ring.signal_uk, own)
+    return np.ascontiguousarray(_means(own, whole)[0])
+
+
+def _means(own: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return means, shape (number, npix), from hits and as many sums, shape (npix, 1 + number): zero without hits.
+
+    Where a part of the rings has no hits they are those of all rings.
+    """
     chosen = np.where(own[:, :1] > 0.0, own, whole)
     return divided(chosen[:, 1:].T, chosen[:, 0])
 
@@ -109,25 +115,6 @@ def _add(pixel, value, sums):  # type: ignore[no-untyped-def]
     for k in range(pixel.size):
         sums[pixel[k], 0] += 1.0
         sums[pixel[k], 1] += value[k]
-
-
-@njit(nogil=True)
-def _add_weighted(pixel, value, theta, phi, psi, orders, sums):  # type: ignore[no-untyped-def]
-    """Add samples to hits and sums of values, of values times directions, and times e^{-i s psi}."""
-    for k in range(pixel.size):
-        own, sine = sums[pixel[k]], math.sin(theta[k])
-        own[0] += 1.0
-        own[1] += value[k]
-        own[2] += value[k] * sine * math.cos(phi[k])
-        own[3] += value[k] * sine * math.sin(phi[k])
-        own[4] += value[k] * math.cos(theta[k])
-        if orders > 0:
-            turn = complex(math.cos(psi[k]), -math.sin(psi[k]))
-            turned = value[k] * turn
-            for s in range(orders):
-                own[5 + 2 * s] += turned.real
-                own[6 + 2 * s] += turned.imag
-                turned *= turn
 
 
 def gain_of(effect: Effect, site: Site, part: Part, orders: int = 0) -> NDArray[np.complex128]:

@@ -184,11 +184,16 @@ def every_ring(spin_period_s: float, number: int, index: int) -> Stage:
 
     def stage(stream: Iterable[Samples]) -> Iterator[Samples]:
         for chunk in stream:
-            own = np.floor(chunk.time_s / spin_period_s).astype(np.int64) % number == index
+            own = on_rings(chunk.time_s, spin_period_s, number, index)
             every = {each.name: getattr(chunk, each.name) for each in fields(chunk)}
             yield Samples(**{name: values[own] if values.size else values for name, values in every.items()})
 
     return stage
+
+
+def on_rings(time_s: NDArray[np.float64], spin_period_s: float, number: int, index: int) -> NDArray[np.bool_]:
+    """Return True for samples of every ``number``-th ring from ring ``index`` on."""
+    return np.asarray(np.floor(time_s / spin_period_s).astype(np.int64) % number == index)
 
 
 def check_noise(sigma0_uk: float) -> None:

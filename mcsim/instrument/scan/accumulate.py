@@ -127,3 +127,36 @@ def _add_samples(start, count, nside, smax, order, middle, sums):  # type: ignor
                 pixel = pixels[k]
                 add_powers(sums[pixel], 4 + 2 * smax, order, middle[pixel], work[0, k], work[1, k], work[2, k])
     return touched
+
+
+@njit(nogil=True, error_model="numpy")
+def add_weighted_samples(start, nside, smax, weights, counted, sums):  # type: ignore[no-untyped-def]
+    """Add the hits of consecutive samples, and weights times what :func:`add_sample` adds, to (npix, 5 + 2 smax) sums.
+
+    ``start`` is that of :meth:`mcsim.instrument.scan.pointing.PointingStream.at`. The second column takes the weights.
+    Samples that do not count are left out; as many as there are ``weights``.
+    """
+    work = np.empty((6, BLOCK))
+    pixels = np.empty(BLOCK, dtype=np.int64)
+    touched = 0.0
+    for first in range(0, weights.size, BLOCK):
+        size = min(BLOCK, weights.size - first)
+        fill_block(start, first, size, work)
+        fill_pixels(nside, work, pixels[:size])
+        for k in range(size):  # reads ahead, as for the moments
+            touched += sums[pixels[k], 0]
+        for k in range(size):
+            if not counted[first + k]:
+                continue
+            own, weight, cos_psi, sin_psi = sums[pixels[k]], weights[first + k], work[3, k], work[4, k]
+            own[0] += 1.0
+            own[1] += weight
+            own[2] += weight * work[0, k]
+            own[3] += weight * work[1, k]
+            own[4] += weight * work[2, k]
+            real, imag = weight * cos_psi, -weight * sin_psi
+            for s in range(smax):
+                own[5 + 2 * s] += real
+                own[6 + 2 * s] += imag
+                real, imag = real * cos_psi + imag * sin_psi, imag * cos_psi - real * sin_psi
+    return touched
