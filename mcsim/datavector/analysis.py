@@ -29,6 +29,7 @@ from mcsim.systematics import Effect, Library, acts_through
 Kinds = tuple[tuple[str, type[Effect]], ...]  #: effects of a library by name, as they are sent to workers
 
 _OTHER_NOISE = 1_000_000
+_EPSILON = 1e-5  #: of the interpolation of samples: errors of a few nK, in maps whose noise is hundreds of times larger
 
 
 @dataclass(frozen=True)
@@ -302,7 +303,7 @@ def simulated_maps(job: Job, library: Library | None = None) -> Iterator[list[Ma
     """Yield the maps of every realization of a job; ``library`` as for :func:`data_vectors`."""
     for realization, shared in surveys(job, library):
         if job.sample_by_sample:
-            yield [map_uk for _, map_uk in sampled.maps(shared, realization)]
+            yield [map_uk for _, map_uk in sampled.maps(shared, realization, epsilon=_EPSILON)]
             continue
         sky, observed = None, b"" if job.observed is None else job.observed.tobytes()
         if observed:

@@ -138,7 +138,7 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
     known = all(channel.site.pointing is not None for channel in analysis.model.survey.channels)
     if time_ordered and analysis.of_maps and known:
         quiet = replace(base.unfiltered(), channels=tuple(c.without_noise() for c in base.channels))
-        for job in _split(analysis.job(quiet), range(settings.time_ordered_skies), 1):
+        for job in _split(analysis.job(quiet), range(_scaled(analysis, settings.time_ordered_skies)), 1):
             jobs[Purpose("time-ordered", job.first)] = replace(job, sample_by_sample=True)
             jobs[Purpose("default", job.first)] = job
     for job in _split(analysis.job(seeded(run, _COVARIANCE)), range(wanted)):
@@ -207,12 +207,17 @@ def skies(analysis: Analysis, candidate: Candidate, sign: int = 1) -> int:
     fewest = settings.channel_skies
     if candidate.channel is None:
         fewest = settings.typical_skies if candidate.parametrization.mean_response else settings.common_skies
-    model = analysis.model
-    shown = float((2.0 * np.arange(model.lmax + 1) + 1.0) @ model.sky_power)
-    fewest = max(FEWEST, math.ceil(fewest * min(1.0, MODES / shown)))
-    count = min(max(fewest, -(-settings.response_modes // model.lmax**2)), settings.noisy_skies)
+    fewest = max(FEWEST, _scaled(analysis, fewest))
+    count = min(max(fewest, -(-settings.response_modes // analysis.model.lmax**2)), settings.noisy_skies)
     opposite = sign < 0 and candidate.parametrization.sign == 0
     return math.ceil(settings.opposite_share * count) if opposite else count
+
+
+def _scaled(analysis: Analysis, skies: int) -> int:
+    """Return as many skies as tell of maps with more modes what so many tell of maps with MODES of them."""
+    model = analysis.model
+    shown = float((2.0 * np.arange(model.lmax + 1) + 1.0) @ model.sky_power)
+    return math.ceil(skies * min(1.0, MODES / shown))
 
 
 def learned(

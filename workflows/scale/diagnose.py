@@ -1,14 +1,15 @@
-"""A diagnosis of six channels and two halves to its end, on few simulations: what it takes and what it finds.
+"""A diagnosis of six channels and two halves to its end: what it takes and what it finds.
 
     python workflows/scale/diagnose.py FOLDER [--nside 512] [--period 0.0512] [--channels 6] [--width 0.95]
-        [--simulations-only 4]
+        [--default] [--workers 2] [--simulations-only 4]
 
 The model is ``six-channels.toml`` beside this file; at another nside its beams are as wide in pixels, and it has the
 same noise in a solid angle. The data are one realization of another seed in which the beam of the last channel, W3, is
 narrower (``--width`` times that of the model), made by the default route. The widths of all beams are the candidates,
-bins are few and wide, and the covariance is that of some 240 simulations. With ``--simulations-only`` so many
-simulations are timed, with this data vector and with that of a default diagnosis of the same candidates. A run that was
-killed goes on with the same cache.
+bins are few and wide, and the covariance is that of some 240 simulations. With ``--default`` it is a diagnosis as
+``mcsim diagnose`` makes it: all effects, bins and simulations. With ``--simulations-only`` so many simulations are
+timed, with this data vector and with that of a default diagnosis of the same candidates. A run that was killed goes on
+with the same cache.
 """
 
 import argparse
@@ -88,6 +89,8 @@ def main() -> None:
     parser.add_argument("--period", type=float, default=0.0512, help="seconds")
     parser.add_argument("--channels", type=int, default=6)
     parser.add_argument("--width", type=float, default=0.95)
+    parser.add_argument("--default", action="store_true")
+    parser.add_argument("--workers", type=int, default=0)
     parser.add_argument("--simulations-only", type=int, default=0)
     arguments = parser.parse_args()
     run = model(arguments.nside, arguments.period, arguments.channels)
@@ -105,15 +108,20 @@ def main() -> None:
                 each.append((middle - start, time.process_time() - middle))
             print(json.dumps({"elements": len(analysis.elements), "maps_s, data_vector_s": np.min(each, 0).tolist()}))
         return
+    started = time.monotonic()
     data(run, arguments.width, arguments.folder / "data")
     made = time.process_time()
-    result = diagnose(
-        run, arguments.folder / "data", arguments.folder / "out", settings=settings, quiet=False, workers=0
-    )
-    used = resource.getrusage(resource.RUSAGE_SELF)
+    if arguments.default:
+        settings = mcsim.DiagnosisSettings()
+    where, workers = (arguments.folder / name for name in ("data", "out")), arguments.workers
+    result = diagnose(run, *where, settings=settings, quiet=False, workers=workers)
+    all_of_it = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    processor = sum(used.ru_utime + used.ru_stime for used in all_of_it)
+    peak = max(used.ru_maxrss for used in all_of_it)
     sets = [[str(effect) for effect in one.effects] for one in result.sets]
     print(json.dumps({"verdict": result.kind, "p_value": result.test.pvalue, "sets": sets}))
-    print(json.dumps({"data_s": made, "processor_s": used.ru_utime + used.ru_stime, "peak_gb": used.ru_maxrss / 1e6}))
+    print(json.dumps({"data_s": made, "processor_s": processor, "peak_gb_of_a_process": peak / 1e6}))
+    print(json.dumps({"wall_s": time.monotonic() - started, "simulations": result.simulations}))
 
 
 if __name__ == "__main__":
