@@ -99,6 +99,7 @@ class DiagnosisSettings:
     channel_skies, typical_skies, common_skies, noisy_skies
         Least number of skies over which a response is averaged: in one channel; of a sky with another mean response;
         of a sky whose response in one realization is mostly random; if the change itself is random or has one sign.
+        Maps that show more than 65,536 modes of the sky need fewer of all but the last, and of ``time_ordered_skies``.
     opposite_share
         Share of these skies in which the opposite step is simulated too; the others take its curvature from these.
     table_skies
