@@ -16,7 +16,7 @@ from mcsim.ensemble.plan import cost
 from mcsim.simulation import simulate
 
 SURVEYS = 2  #: surveys with effects that a worker holds besides the model
-SAMPLE_S = 3e-7  #: seconds that one sample of the time-ordered reference takes on one core
+SAMPLE_S = 2e-7  #: seconds that one sample of the time-ordered reference takes on one core
 
 
 def lines(analysis: Analysis, jobs: Mapping[Purpose, Job]) -> list[str]:

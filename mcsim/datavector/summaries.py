@@ -193,7 +193,8 @@ def _beam_block(model: Model, part: int) -> Block:
         # Above these orders the channel's sum is measured, in the place of its first map.
         alike = whole if s <= settings.split_beam_orders else replace(whole, split=None, fold=None)
         alike = replace(alike, L=s, M=0, parity="even", kind="beam")
-        for low, high in bins(2, model.lmax, settings.beam_bins[s]):
+        end = int(model.last_degrees[own.channel, s]) if s else model.lmax
+        for low, high in bins(2, end, settings.beam_bins[s]):
             kernel = np.where((ell >= low) & (ell <= high), shape, 0.0)
             for short, component in (("re", "real" if s else None), ("im", "imaginary"))[: 2 if s else 1]:
                 kernels.append((s, short, kernel))

@@ -48,6 +48,7 @@ preconditioner has no such sharp end (:class:`mcsim.simulation.preconditioner.Pr
 EXACT = 0.1  #: filter_tolerance of the exact filter
 
 TAIL = 1e-3  #: part of the squared S/N of a change of a beam that is left beyond the last degree of its order
+EARLIEST = 16  #: degree at which orders may end: bins have degrees
 SAVED = 0.1  #: least part of a transform that an earlier last degree must save
 
 LEFT = 0.01  #: share of what was subtracted from maps that stays in :meth:`Part.without_response`
@@ -138,7 +139,7 @@ class Model:
         powers = (ell / max(self.lmax, 1)) ** (2 * np.arange(self.settings.beam_orders + 1.0)[:, None])
         squared = (2.0 * ell + 1.0) * self.cl * self.sky_power * self.response[:, None] ** 2 * powers
         beyond = np.cumsum(squared[..., ::-1], axis=-1)[..., ::-1]
-        last = np.sum(beyond >= TAIL * beyond[..., :1], axis=-1) - 1
+        last = np.maximum(np.sum(beyond >= TAIL * beyond[..., :1], axis=-1) - 1, min(self.lmax, EARLIEST))
         little = (last + 1.0) ** 2 > (1.0 - SAVED) * (self.lmax + 1.0) ** 2
         return np.where(little, self.lmax, last)
 

@@ -59,7 +59,7 @@ def toy(names, simulations=800, seed=1, common=0.0):
     ensemble = NullEnsemble(
         rng.standard_normal((simulations, p)), np.zeros(p), described, np.zeros((24, p)), *np.zeros((4, 0, 0))
     )
-    model = SimpleNamespace(lmax=128, settings=DiagnosisSettings())
+    model = SimpleNamespace(lmax=128, sky_power=np.ones(129), settings=DiagnosisSettings())
     labels = tuple(label for candidate in candidates for label in candidate.labels)
     bank = TemplateBank(t, np.zeros_like(t), np.zeros_like(t), labels)
     return context(Analysis(model, candidates, tuple(blocks)), ensemble, bank)

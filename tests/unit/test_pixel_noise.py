@@ -8,6 +8,7 @@ import pytest
 from mcsim import config
 from mcsim.datavector import pixel_noise
 from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.summaries import blocks_of
 from mcsim.datavector.wiener_filter import Model, model_of, wiener_filter
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -70,3 +71,14 @@ def test_orders_are_those_of_whole_transforms_up_to_their_end(blurred: Model) ->
 def test_transforms_that_would_hardly_be_shorter_are_whole(blurred: Model) -> None:
     sharp = replace(blurred, response=np.ones_like(blurred.response), sky_power=np.ones(91), cl=np.ones(91))
     np.testing.assert_array_equal(sharp.last_degrees, np.full((1, 5), 90))
+
+
+def test_every_element_of_a_beam_varies_where_orders_end_early(blurred: Model) -> None:
+    """The ranges of an order end with it: beyond, numbers would be zero in all simulations."""
+    blocks = [block for block in blocks_of(blurred) if block.elements[0].kind == "beam"]
+    filtered = [wiener_filter(blurred, list(simulate.maps(blurred.survey, realization))) for realization in range(3)]
+    rows = [np.concatenate([block.values(one) for block in blocks]) for one in filtered]
+    assert np.all(np.std(rows, axis=0) > 0.0)
+    for element in (element for block in blocks for element in block.elements):
+        assert element.ell is not None
+        assert element.ell[1] <= (blurred.last_degrees[0, element.L] if element.L else 90)
