@@ -28,6 +28,7 @@ from mcsim.cli.common import (
     Workers,
     chosen,
     picture,
+    processes,
     save,
 )
 from mcsim.errors import InputError, RunError
@@ -212,9 +213,9 @@ def diagnose(
     settings = chosen_settings(
         without=tuple(without or ()), including=tuple(including or ()), simulations=simulations, controls=controls
     )
-    if workers is not None:
-        run = replace(run, compute=replace(run.compute, workers=workers))
     if dry_run:
+        number = processes(where) or run.compute.workers
+        run = replace(run, compute=replace(run.compute, workers=number))
         print(describe(run, settings, data))
         return
     if output is None:

@@ -12,6 +12,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from mcsim.errors import InputError
 from mcsim.support.folders import outside_stores, unwritable, user_path
+from mcsim.support.loading import loaded
 
 
 def _without_types(options: list[Any]) -> list[Any]:
@@ -105,6 +106,11 @@ def chosen(workers: int | None, scheduler: str | None) -> int | str | None:
     if workers is not None and scheduler is not None:
         raise InputError("--workers and --scheduler exclude each other: workers of a running scheduler are its own.")
     return workers if scheduler is None else scheduler
+
+
+def processes(where: int | str | None) -> int | None:
+    """Return the number of processes that --workers asks for or a running scheduler has; None: neither is named."""
+    return loaded("mcsim.ensemble.runner.cluster").threads_of(where) if isinstance(where, str) else where
 
 
 def picture(asked: Path | None, shown: str | Path, end: str = "") -> Path:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from mcsim.cli.common import Config, Part, Png, Processes, Scheduler, chosen, picture, save
+from mcsim.cli.common import Config, Part, Png, Processes, Scheduler, chosen, picture, processes, save
 from mcsim.errors import InputError
 from mcsim.support.loading import loaded
 
@@ -37,7 +37,7 @@ def run(
     if dry_run:
         from mcsim.ensemble import plan
 
-        print(plan.describe(config, part, workers, store, resume))
+        print(plan.describe(config, part, processes(where), store, resume))
         return
     runner = loaded("mcsim.ensemble.runner")
     _report(runner.run(config, store, resume=resume, realizations=part, workers=where, quiet=False))

@@ -21,7 +21,7 @@ import xarray as xr
 import zarr
 from astropy.io import fits
 from astropy.table import Table
-from distributed import Client
+from distributed import Client, LocalCluster
 
 from mcsim import cli, config, open_summary
 from mcsim.ensemble import runner, tables
@@ -166,6 +166,18 @@ def test_dry_run_says_the_cost_and_computes_nothing(mcsim: Command, tmp_path: Pa
     for word in ("memory", "disk", "files", "time", "realizations"):
         assert word in out
     assert list(tmp_path.iterdir()) == []
+
+
+def test_dry_run_counts_the_workers_of_a_scheduler(mcsim: Command, client: Client, tmp_path: Path) -> None:
+    """The two of the fixture are there; of those of a scheduler without any the time is not known."""
+    (tmp_path / "small.toml").write_text(SMALL.replace("seed = 7", "seed = 7\n[compute]\nworkers = 7"))
+    dry = ("run", "small.toml", "--dry-run")
+    assert "7 workers" in mcsim(*dry)[1]
+    assert "2 workers" in mcsim(*dry, "--scheduler", client.scheduler.address)[1]
+    idle = LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0")
+    with idle, Client(idle, set_as_default=False) as connected:
+        address = connected.scheduler.address
+        assert_refused(mcsim(*dry, "--scheduler", address), address, "--workers")
 
 
 def test_dry_run_says_what_a_store_holds_and_what_is_left(mcsim: Command, copy: Path, tmp_path: Path) -> None:

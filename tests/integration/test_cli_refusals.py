@@ -56,6 +56,8 @@ from .conftest import SMALL, Command, assert_refused
         (("run", "quickstart", "--realizations", "-1:3"), ("--realizations", "-1:3", "A:B")),
         (("run", "quickstart", "--realizations", "0:1000"), ("0:1000", "0:64")),
         (("run", "quickstart", "--scheduler", "nonsense"), ("nonsense", "5 s")),
+        (("run", "quickstart", "--dry-run", "--scheduler", "nonsense"), ("nonsense", "5 s")),
+        (("diagnose", "tiny", "x", "--dry-run", "--scheduler", "nonsense"), ("nonsense", "5 s")),
     ],
 )
 def test_bad_input_is_one_sentence(

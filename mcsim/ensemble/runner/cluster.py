@@ -242,6 +242,18 @@ def remote_client(scheduler: str) -> Iterator[Client]:
         yield client
 
 
+def threads_of(scheduler: str) -> int:
+    """Return the number of threads of the workers of a running scheduler; InputError if there is none."""
+    with remote_client(scheduler) as client:
+        found = sum(client.nthreads().values())
+    if not found:
+        raise InputError(
+            f"The scheduler at {scheduler} has no worker yet, so the time is not known; start its workers, or give the "
+            "number that there will be with --workers."
+        )
+    return found
+
+
 def _check_workers(client: Client) -> None:
     """Raise InputError for workers with other packages; the first task checks those that join later."""
     for address, answer in client.run(packages, on_error="return").items():
