@@ -130,14 +130,14 @@ def analysis_of(
     settings = settings or DiagnosisSettings()
     if run.nuisances:
         settings = settings.without_shrinkage()
-    known = kinds_of(library)
+    known = kinds_of(library, run)
     check_nuisances(run, dict(known))
     if source is not None and run.nuisances:
         raise InputError(
             f"nuisances are drawn by mcsim's simulations, but {source.label} simulates in their place; let it draw "
             "them, and leave [[nuisance]] out."
         )
-    declared = [one.effect for one in run.nuisances]
+    declared = _declared(run)
     model = model_of(survey(run, nthreads=nthreads, orders=settings.beam_orders, library=dict(known)), settings)
     proposed = [
         (name, effect)
@@ -166,7 +166,7 @@ def _candidates(model: Model, kinds: Sequence[tuple[str, type[Effect]]]) -> Iter
     """Yield the effects of some kinds wherever they apply."""
     run = model.survey.config
     frequencies = [c.site.frequency_ghz if c.site.foregrounds else None for c in model.survey.channels]
-    declared = [one.effect for one in run.nuisances]
+    declared = _declared(run)
     for name, effect in kinds:
         # A nuisance is fitted in the coordinates of its prior.
         fit = effect.parametrization if name in declared else effect.parametrization.seen_at(frequencies)
@@ -177,9 +177,16 @@ def _candidates(model: Model, kinds: Sequence[tuple[str, type[Effect]]]) -> Iter
                     yield Candidate(effect, channel, columns, dict(fixed), step=_step(model, effect, channel), fit=fit)
 
 
-def kinds_of(library: Library | None) -> Kinds:
-    """Return the effects of a library; None: built-in and registered ones."""
-    return tuple((systematics.catalogue() if library is None else library).items())
+def kinds_of(library: Library | None, run: config.RunConfig | None = None) -> Kinds:
+    """Return the effects of a library (None: built-in and registered ones), and those of a run's nuisances."""
+    known = dict(systematics.catalogue() if library is None else library)
+    declared = () if run is None else nuisances_of(run, known)
+    return tuple((known | {one.effect.name: one.effect for one in declared}).items())
+
+
+def _declared(run: config.RunConfig) -> set[str]:
+    """Return the names of the effects that are nuisances of a run."""
+    return {systematics.called(one.effect) for one in run.nuisances}
 
 
 def _hindrance(model: Model, kind: type[Effect], channel: str | None, settings: Mapping[str, Any]) -> str | None:

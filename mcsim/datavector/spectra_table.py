@@ -196,7 +196,7 @@ def analysis_of_spectra(
 
     Arguments are those of :func:`~mcsim.datavector.analysis.analysis_of`.
     """
-    excluded = [name for name, kind in kinds_of(library) if not acts_through(kind, *_SPECTRAL_HOOKS)]
+    excluded = [name for name, kind in kinds_of(library, run) if not acts_through(kind, *_SPECTRAL_HOOKS)]
     settings = (settings or DiagnosisSettings()).without_shrinkage()
     analysis = analysis_of(run, (*without, *excluded), nthreads, settings, library)
     return replace(analysis, blocks=(Block(measured.elements, lambda filtered: measured.value),), of_maps=False)

@@ -156,11 +156,8 @@ def _with_library(settings: DiagnosisSettings) -> tuple[DiagnosisSettings, syste
     known = {**known, **{kinds[name].name: kinds[name] for name in asked}}
     including = tuple(sorted({kinds[name].name for name in asked if not kinds[name].proposed}))
     named = tuple(kinds[name].name for name in settings.including)
-    return (
-        replace(settings, without=tuple(settings.without), including=including, library=None, controls=0),
-        known,
-        named,
-    )
+    without = tuple(kinds[name].name for name in settings.without)
+    return replace(settings, without=without, including=including, library=None, controls=0), known, named
 
 
 def describe(

@@ -207,7 +207,9 @@ def inverse_covariance(analysis: Analysis, settings: LimitSettings, nthreads: in
 def _with_declared(run: config.RunConfig, settings: LimitSettings) -> tuple[config.RunConfig, LimitSettings]:
     """Return a run without its nuisances, and settings with them; InputError for one that settings cannot hold."""
     found = {}
-    for one in nuisances_of(run, settings.library and dict(settings.library)):
+    library = dict(systematics.catalogue() if settings.library is None else systematics.checked(settings.library))
+    for one in nuisances_of(run, library):
+        library[one.effect.name] = one.effect
         name = one.effect.name if one.channel is None else f"{one.effect.name}:{one.channel}"
         if one.settings or one.parameter_widths or len(set(one.widths)) > 1:
             raise InputError(
@@ -215,7 +217,13 @@ def _with_declared(run: config.RunConfig, settings: LimitSettings) -> tuple[conf
                 f"effect; leave the table out, and give --nuisance {name}={max(one.widths):g}."
             )
         found[name] = one.widths[0]
-    return replace(run, nuisances=()), replace(settings, nuisances=found | dict(settings.nuisances))
+    for text, width in settings.nuisances.items():
+        name, colon, channel = text.partition(":")
+        if name.endswith(".py"):
+            kind = systematics.get(name)
+            name, library[kind.name] = kind.name, kind
+        found[f"{name}{colon}{channel}"] = width
+    return replace(run, nuisances=()), replace(settings, library=library, nuisances=found)
 
 
 def _candidates(
@@ -231,7 +239,7 @@ def _candidates(
         raise InputError(f"probes = {settings.probes} are too few to tell an error; give 3 or more.")
     if not 0.0 <= settings.unknown_dipole_uk < np.inf:
         raise InputError(f"unknown_dipole_uk = {settings.unknown_dipole_uk:g} is no rms; give 0 or more.")
-    library = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
+    library = systematics.catalogue() if settings.library is None else settings.library
     asked = {name: systematics.get(name, library) for name in (*settings.only, *settings.without)}
     library = {**library, **{kind.name: kind for kind in asked.values()}}
     only, without = ([asked[name].name for name in names] for names in (settings.only, settings.without))

@@ -22,8 +22,9 @@ class LimitSettings:
         Effects by name, as :func:`mcsim.effects` returns them; None: all of these.
     nuisances
         Width of the Gaussian prior, in the effect's unit, of every coordinate of effects that are unknown but not
-        looked for: ``{"beam_width": 0.01}`` in every channel, ``{"beam_width:W1": 0.01}`` in one. The limits of the
-        others are marginalised over them, and over the nuisances of the run.
+        looked for: ``{"beam_width": 0.01}`` in every channel, ``{"beam_width:W1": 0.01}`` in one; ``"FILE.py"`` or
+        ``"FILE.py:W1"`` for the effect of a file. The limits of the others are marginalised over them, and over the
+        nuisances of the run.
     unknown_dipole_uk
         Rms over the sky, in uK, of a monopole and of a dipole that all maps share and of which nothing is known; 0: the
         model's spectrum says all of the sky. A model without power there knows them, but for noise, and so knows what

@@ -22,7 +22,7 @@ from mcsim.systematics.base import (
 )
 from mcsim.systematics.hooks import HookError
 from mcsim.systematics.parametrization import Parametrization
-from mcsim.systematics.registry import Library, basis_of, build, catalogue, checked, effects, get, in_file
+from mcsim.systematics.registry import Library, basis_of, build, called, catalogue, checked, effects, get, in_file
 
 __all__ = [
     "Alm",
@@ -40,6 +40,7 @@ __all__ = [
     "adding",
     "basis_of",
     "build",
+    "called",
     "catalogue",
     "checked",
     "disturbing",

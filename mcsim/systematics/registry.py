@@ -130,6 +130,11 @@ def get(name: str, library: Library | None = None) -> type[Effect]:
     return known[name]
 
 
+def called(name: str) -> str:
+    """Return the name of an effect that is given by its name or by the path of a file."""
+    return of_file(name).name if name.endswith(".py") else name
+
+
 def of_file(path: str) -> type[Effect]:
     """Return the effect that a Python file defines; InputError if it cannot be run, or defines none or several."""
     found = in_file(path)

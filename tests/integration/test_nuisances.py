@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import healpy
 import numpy as np
@@ -39,6 +40,7 @@ MODEL = two_channels("company", sigma0_uk=60.0) | {
     ],
 }
 SIMULATIONS, SKIES = 400, 320
+FILE = str(Path(__file__).parents[2] / "docs" / "howto" / "gain_step.py")
 
 
 def small_analysis(run, *more):
@@ -198,3 +200,13 @@ def test_settings_without_nuisances_keep_the_verdict(run, undeclared):
     assert undeclared.calibration.held_out_combined is None
     found = diagnose_data(ObservedMaps(undeclared, maps_of(run), ask), "plain")
     assert "nuisances" not in found.to_json()
+
+
+def test_a_nuisance_of_a_file_is_a_candidate(run):
+    """It was none, and data beyond its prior ended in a KeyError of its name."""
+    one = config.Nuisance(effect=FILE, width=(1e-3,), channel="V1")
+    analysis = small_analysis(replace(run, nuisances=(one,)))
+    assert ("gain_step", "V1") in {candidate.identity for candidate in analysis.candidates}
+    assert "gain_step" in dict(analysis.library)
+    settings, *_ = api._with_library(DiagnosisSettings(without=(FILE,)))
+    assert settings.without == ("gain_step",)

@@ -150,6 +150,21 @@ def test_an_effect_of_a_file_has_a_limit_and_one_that_cannot_act_has_none() -> N
         )
 
 
+def test_an_effect_of_a_file_is_a_nuisance() -> None:
+    """It was refused: "nuisance 'gain_step:V1' is no effect of this model"."""
+    file = str(Path(__file__).parents[2] / "docs" / "howto" / "gain_step.py")
+    declared = replace(model(), nuisances=(config.Nuisance(effect=file, width=(1.0,), channel="V1"),))
+    ways = ((model(), {}), (declared, {}), (model(), {f"{file}:V1": 1.0}))
+    alone, *beside = (
+        mcsim.limit(run, settings=mcsim.LimitSettings(only=("gain_drift",), nuisances=own, dense=True))
+        for run, own in ways
+    )
+    assert beside[0].effects[0].channel == "V1"
+    assert beside[0].effects[0].sigma > 1.01 * alone.effects[0].sigma
+    np.testing.assert_array_equal(beside[0].fisher, beside[1].fisher)
+    assert "gain_step:V1" in beside[1].unknowns
+
+
 @pytest.mark.parametrize("name", ["beam_width", "pointing_offset"])
 def test_a_beam_changes_what_samples_off_their_pixel_centres_see(name: str) -> None:
     """F = 1/2 Tr[C^-1 dC C^-1 dC] + dmu' C^-1 dmu, from whole covariances of the simulator with those samples."""
