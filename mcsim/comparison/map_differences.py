@@ -24,6 +24,9 @@ OWN = 0.3
 It is counted over that by which its side B differs from side A of the channel whose maps it might have.
 """
 
+BROUGHT = 0.5
+"""Share of another channel's noise, over that of a map's own that is gone, which has to be there to be shared."""
+
 MORE_ALIKE = 0.2
 """By how much mirrored maps must correlate more with side B: maps of different skies do so by chance, or a little."""
 
@@ -286,6 +289,24 @@ def _of_both(noise: Maps, value: Vector, state: State) -> bool:
     return -float(np.sum(noise * rest)) < 0.5 * (1.0 + expected) * float(np.sum(noise**2))
 
 
+def _is_brought(noise: Maps, way: Vector, state: State) -> bool:
+    """Return True if another channel's noise less a map's own explains side B by what it brings.
+
+    What noise hides of the sky is in both of what the sky leaves of the channels, and what a beam makes of it in side B
+    is like the difference of these. It is not in the noise of the other channel about the sky of its own maps.
+    """
+    if way[0] >= 0:
+        return True
+    pair, there = state.pair, state.others[int(way[1])]
+    if pair.scene is None or there.scene is None:
+        return True
+    own = pair.a - pair.scene.maps()
+    skies = there.scene.maps() - replace(there.scene, sky=pair.scene.sky).maps()
+    [exchanged] = state.fit([noise])
+    brought, *_ = state.fit([noise, *(np.where(noise != 0.0, one, 0.0) for one in (own, skies))])
+    return bool(brought * exchanged > BROUGHT * exchanged**2)
+
+
 class NoiseShared(Difference):
     """One split of side B has noise in common with another one, or all have with another channel."""
 
@@ -314,7 +335,7 @@ class NoiseShared(Difference):
         return [
             value + np.eye(5)[0] * state.fit([maps])
             for value, maps in made
-            if _is_noise(maps, state) and _of_both(maps, value, state)
+            if _is_noise(maps, state) and _of_both(maps, value, state) and _is_brought(maps, value[1:], state)
         ]
 
     def _exchanged(self, way: Vector, state: State) -> Maps:
