@@ -204,12 +204,18 @@ def fits_maps(parts: tuple[Part, ...], template: str) -> FitsMaps:
                 pattern += "*" if own is None else glob.escape(own)
                 expression += r"(\d+)" if own is None else re.escape(own)
         matches = [re.fullmatch(expression, path) for path in glob.glob(pattern)]
-        numbers = sorted({int(match[1]) for match in matches if match is not None and match.re.groups})
-        numbers = [r for r in numbers if os.path.isfile(found._path(first, r))]
+        named = {match[0]: int(match[1]) for match in matches if match is not None and match.re.groups}
+        numbers = sorted(set(named.values()))
+        others = sorted(path for path, r in named.items() if str(found._path(first, r)) != path)
     except (ValueError, KeyError, IndexError) as error:
         raise InputError(
             f"{template} is no template of files ({error}); use {{realization}}, {{channel}} and {{split}}."
         ) from None
+    if others:
+        raise InputError(
+            f"{others[0]} fits {template} but for the digits of its number; write {{realization}} with the digits that "
+            "the names have, {realization:05d} for 00001 and {realization} for 1, or move it away."
+        )
     if not numbers:
         raise InputError(
             f"no file fits {template}; check its folder, and that {{realization}} stands once, where the number does."

@@ -1,0 +1,40 @@
+"""Stored maps of another program: which files a template names."""
+
+from pathlib import Path
+
+import pytest
+
+from mcsim.ensemble.external_maps import Part, fits_maps
+from refusals import refused
+
+PARTS = (Part("V", "V", None, None, "galactic"),)
+
+
+def files(folder: Path, names: list[str]) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).touch()
+
+
+@pytest.mark.parametrize(
+    ("field", "digits"), [("{realization}", 1), ("{realization:03d}", 3), ("{realization:05d}", 5)]
+)
+def test_all_files_of_a_template_are_realizations(field: str, digits: int, tmp_path: Path) -> None:
+    files(tmp_path, [f"V_{r:0{digits}d}.fits" for r in (1, 20, 300)] + ["V_mean.fits", "W_7.fits"])
+    assert fits_maps(PARTS, str(tmp_path / f"{{channel}}_{field}.fits")).realizations == (1, 20, 300)
+
+
+@pytest.mark.parametrize(
+    ("field", "names"),
+    [
+        ("{realization:03d}", ["V_1.fits", "V_20.fits", "V_300.fits"]),
+        ("{realization}", ["V_001.fits", "V_300.fits"]),
+        ("{realization:05d}", ["00001/V_1.fits"]),
+    ],
+)
+def test_a_file_with_other_digits_is_not_left_out_in_silence(field: str, names: list[str], tmp_path: Path) -> None:
+    """Of V_1.fits to V_300.fits, 201 were the ensemble of V_{realization:03d}.fits, and nothing was said."""
+    files(tmp_path, names)
+    template = "/".join(["{realization:05d}", "V_{realization:05d}.fits"] if "/" in names[0] else [f"V_{field}.fits"])
+    with refused(names[0], "{realization}", "{realization:05d}"):
+        fits_maps(PARTS, str(tmp_path / template))
