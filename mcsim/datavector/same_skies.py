@@ -13,13 +13,23 @@ from mcsim import config, systematics
 from mcsim.datavector.analysis import Analysis, Job
 from mcsim.datavector.campaign import Ask, after_jobs, constrained_jobs
 from mcsim.datavector.wiener_filter import inverse_of, shared_sky
+from mcsim.instrument.beams import Beam
+from mcsim.simulation import convolve
+from mcsim.simulation.survey import Channel
 from mcsim.support.arrays import Alm, Map, Matrix, Vector, divided
 
 SMALL = 2e-3  #: gain of a channel that observed skies may have in them: responses are wrong by less than this share
 
 BENT = 0.1  #: change of a beam at some degree, beside a gain, that observed skies may have in them
 
+ROUNDS, STILL = 8, 1e-3  #: of finding a sky that is seen through other orders of beams, and relative change at the end
+
 Factors = tuple[tuple[float, ...], ...]  #: by which channels see degrees otherwise, (channel, lmax + 1); (): not
+
+Orders = tuple[bytes, ...]
+"""What beams have more in orders m > 0, by channel: complex b_lm, (m, lmax + 1), the first row zero; b"": little."""
+
+Seen = tuple[Factors, Orders]  #: how channels see a sky otherwise
 
 Skies = Literal["reference", "typical", "constrained"]
 
@@ -47,43 +57,94 @@ class SameSkies:
         -----
         A gain 1 + g of one channel is in the filtered sky with a weight w: its response there is 1 + w g times the true
         one, and a fit gives g/(1 + w g). So it is with each degree that a beam loses. Gains up to SMALL and beams up to
-        BENT, the steps of linear responses among them, stay.
+        BENT, the steps of linear responses among them, stay. What orders m > 0 of a beam add to a map is another map of
+        the sky, which is in the filtered one with a weight, too: it is computed from the sky that is found, and taken
+        from the maps, until that sky changes no more.
         """
-        return self._skies(self.factors(found))
+        return self._skies(self.seen(found))
 
     @cached_property
-    def _skies(self) -> Callable[[Factors], Alm]:
-        @cache
-        def sky(factors: Factors) -> Alm:
-            model = self.analysis.model
-            if not factors:
-                return shared_sky(model, self.maps)
-            rows = np.array(factors)
-            gains = np.where(np.ptp(rows, axis=1) == 0.0, rows[:, 0], 1.0)
-            pairs = zip(self.maps, gains[[part.channel for part in model.parts]], strict=True)
-            given = [map_ if g == 1.0 else np.where(map_ == healpy.UNSEEN, map_, map_ / g) for map_, g in pairs]
-            if np.any((shapes := rows / gains[:, None]) != 1.0):
-                response = model.response * shapes
-                inverse = None if model.inverse is None else inverse_of(model.cl, response, model.parts)
-                model = replace(model, response=response, inverse=inverse)
-            return shared_sky(model, given)
+    def _skies(self) -> Callable[[Seen], Alm]:
+        return cache(self._sky)
 
-        return sky
+    def _sky(self, seen: Seen) -> Alm:
+        """Return the filtered sky of the maps if channels see it otherwise."""
+        factors, orders = seen
+        found = before = self._through(factors, self.maps)
+        changed = np.inf
+        for _ in range(ROUNDS if orders else 0):
+            last, before, found = changed, found, self._through(factors, self._without(orders, found))
+            changed = float(np.linalg.norm(found - before) / np.linalg.norm(before))
+            if changed >= last:
+                return before
+            if changed < STILL:
+                break
+        return found
+
+    def _through(self, factors: Factors, maps: Sequence[Map]) -> Alm:
+        """Return the filtered sky of maps whose degrees channels see otherwise."""
+        model = self.analysis.model
+        if not factors:
+            return shared_sky(model, maps)
+        rows = np.array(factors)
+        gains = np.where(np.ptp(rows, axis=1) == 0.0, rows[:, 0], 1.0)
+        pairs = zip(maps, gains[[part.channel for part in model.parts]], strict=True)
+        given = [map_ if g == 1.0 else np.where(map_ == healpy.UNSEEN, map_, map_ / g) for map_, g in pairs]
+        if np.any((shapes := rows / gains[:, None]) != 1.0):
+            response = model.response * shapes
+            inverse = None if model.inverse is None else inverse_of(model.cl, response, model.parts)
+            model = replace(model, response=response, inverse=inverse)
+        return shared_sky(model, given)
+
+    def _without(self, orders: Orders, sky: Alm) -> list[Map]:
+        """Return the maps without what other orders of the beams show of a sky."""
+        model, made = self.analysis.model, []
+        for part, map_ in zip(model.parts, self.maps, strict=True):
+            more = np.frombuffer(orders[part.channel], dtype=np.complex128).reshape(-1, model.lmax + 1)
+            if len(more):
+                channel = model.survey.channels[part.channel]
+                through = convolve.response(Beam(more[: part.moments.smax + 1]), model.lmax, channel.window)
+                added = convolve.noncircular_map(convolve.spin_maps(sky, through, model.nside), part.moments)
+                map_ = np.where(map_ == healpy.UNSEEN, map_, map_ - added)
+            made.append(map_)
+        return made
+
+    def seen(self, found: Sequence[config.Effect]) -> Seen:
+        """Return how the channels see a sky otherwise with effects."""
+        return self.factors(found), self.orders(found)
+
+    def orders(self, found: Sequence[config.Effect]) -> Orders:
+        """Return what effects add to the orders m > 0 of the beams; () if all is little."""
+        model, rows = self.analysis.model, []
+        for channel, made in zip(model.survey.channels, model.survey.making.channels, strict=True) if found else ():
+            before, after = (beam.blm[:, : model.lmax + 1] for beam in self._beams(channel, found))
+            change = np.zeros((max(len(before), len(after)), model.lmax + 1), dtype=np.complex128)
+            change[: len(after)] += after
+            change[: len(before)] -= before
+            change[0] = 0.0
+            little = np.abs(change).max() == 0.0 or made.side_b is not None
+            little = little or divided(np.abs(change).max(axis=0), np.abs(before[0])).max() <= BENT
+            rows.append(b"" if little else change.tobytes())
+        return tuple(rows) if any(rows) else ()
+
+    def _acting(self, channel: Channel, found: Sequence[config.Effect]) -> list[systematics.Effect]:
+        library = dict(self.analysis.library)
+        own = [one for one in found if one.channel in (None, channel.name)]
+        return [systematics.build(library[one.name], dict(one.parameters)) for one in own]
+
+    def _beams(self, channel: Channel, found: Sequence[config.Effect]) -> tuple[Beam, Beam]:
+        """Return the beam of a channel without effects on its shape and with them."""
+        return channel.site.beam, systematics.seen_through(self._acting(channel, found), channel.site, displacing=())
 
     def factors(self, found: Sequence[config.Effect]) -> Factors:
         """Return by how much effects change what each channel sees, by degree; () if all is close to 1.
 
         It is one number for all degrees where the effects rescale the channel as a whole.
         """
-        model, library, rows = self.analysis.model, dict(self.analysis.library), []
+        model, rows = self.analysis.model, []
         for channel in model.survey.channels if found else ():
-            own = [one for one in found if one.channel in (None, channel.name)]
-            acting = [systematics.build(library[one.name], dict(one.parameters)) for one in own]
-            row = np.full(model.lmax + 1, systematics.rescaling(acting, channel.site))
-            before, after = (
-                beam.blm[0, : model.lmax + 1].real
-                for beam in (channel.site.beam, systematics.seen_through(acting, channel.site, displacing=()))
-            )
+            row = np.full(model.lmax + 1, systematics.rescaling(self._acting(channel, found), channel.site))
+            before, after = (beam.blm[0, : model.lmax + 1].real for beam in self._beams(channel, found))
             shape = np.where(before > 0.0, divided(after, before), 1.0)
             rows.append(shape if np.abs(shape / row - 1.0).max() > BENT else row)
         return (
@@ -91,10 +152,10 @@ class SameSkies:
         )
 
     @cached_property
-    def _before(self) -> dict[tuple[bool, bool, Factors], list[Vector]]:
+    def _before(self) -> dict[tuple[bool, bool, Seen], list[Vector]]:
         """Return data vectors without any effect, as many as were needed so far.
 
-        Keys are True for constrained skies, for an external simulator, and the factors that these skies are without.
+        Keys are True for constrained skies, for an external simulator, and how the maps were seen that constrain them.
         """
         return defaultdict(list)
 
@@ -136,12 +197,12 @@ class SameSkies:
     def pair(self, found: Sequence[config.Effect], skies: int, constrained: bool) -> tuple[Matrix, Matrix]:
         """Return data vectors of the same skies without effects and with them, which the observed maps have too."""
         jobs = self._jobs(found, constrained, skies, there=found)
-        after, source = self._simulated(jobs), jobs[0].source
-        before = self._before[constrained, source is not None, self.factors(found) if constrained else ()]
+        source = jobs[0].source
+        before = self._before[constrained, source is not None, self.seen(found) if constrained else ((), ())]
         if (first := len(before)) < skies:
             same = [replace(job, source=source) for job in self._jobs((), constrained, skies, first, found)]
             before.extend(self._simulated(same)[first - skies :])
-        return np.stack(before[:skies]), after
+        return np.stack(before[:skies]), self._simulated(jobs)
 
     def _jobs(
         self,

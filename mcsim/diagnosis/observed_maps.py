@@ -89,7 +89,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
 
     def rescaled(self, found: Sequence[config.Effect]) -> bool:
         """Return True if the observed sky has to be found as effects let the channels see it."""
-        return bool(self.same_skies.factors(found))
+        return any(self.same_skies.seen(found))
 
     def templates(self) -> Matrix:
         """Return the templates; those that depend on the very sky are measured on the observed one if it departs."""

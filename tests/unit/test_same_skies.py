@@ -30,7 +30,7 @@ def test_effects_are_asked_for_at_once_and_then_known(monkeypatch: pytest.Monkey
     asked: list[list[str]] = []
     monkeypatch.setattr(SameSkies, "_jobs", jobs)
     monkeypatch.setattr(SameSkies, "skies_of", lambda *_: "constrained")
-    monkeypatch.setattr(SameSkies, "factors", lambda *_: ())
+    monkeypatch.setattr(SameSkies, "seen", lambda *_: ((), ()))
     monkeypatch.setattr("mcsim.datavector.same_skies.replace", lambda job, **_: job)
     skies = SameSkies(None, ask, ())  # type: ignore[arg-type]
     effects = [config.Effect(name=name) for name in ("a", "bb")]
@@ -99,3 +99,20 @@ def test_the_sky_of_maps_with_another_beam_is_found_through_it(masked: bool) -> 
         expected = np.exp(-0.5 * ell * (ell + 1) * variance * ((1.0 + amplitude) ** 2 - 1.0))
         np.testing.assert_allclose(factors[0], expected, rtol=1e-6)
         assert skies.factors(beams[:1])[1] == (1.0,) * len(ell)
+
+
+def test_the_sky_of_maps_with_an_ellipse_is_found_through_it() -> None:
+    """What the ellipse adds to a map is no sky; a small one stays, as in the skies of linear responses."""
+    run = config.load(two_channels("ellipses", sigma0_uk=1.0))
+    analysis = analysis_of(run, without=tuple(name for name in systematics.catalogue() if name != "beam_width"))
+    expected = SameSkies(analysis, list, list(simulate.maps(survey(run), 0))).observed
+    for amplitude, both in ((0.6, True), (-0.6, False)):
+        parameters = {"amplitude": amplitude, "angle_deg": 30.0}
+        names = ("V1", "W1") if both else ("W1",)
+        ellipse = [config.Effect(name="beam_ellipticity", channel=name, parameters=parameters) for name in names]
+        skies = SameSkies(analysis, list, list(simulate.maps(survey(with_effects(run, ellipse)), 0)))
+        circular = skies._through(skies.factors(ellipse), skies.maps)
+        off, left = (np.linalg.norm(one - expected) for one in (circular, skies.observed_with(ellipse)))
+        assert left < 0.3 * off
+    slight = [config.Effect(name="beam_ellipticity", channel="W1", parameters={"amplitude": 0.02})]
+    assert skies.seen(slight) == ((), ())
