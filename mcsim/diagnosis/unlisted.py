@@ -142,7 +142,7 @@ class Reconstruction:
     x: Vector  # scores
     marginal: Marginal
     _fitted: dict[tuple[int, ...], Fitted] = field(default_factory=dict, repr=False)
-    _trial: dict[int, tuple[Matrix, Matrix]] = field(default_factory=dict, repr=False)
+    _trial: dict[int, Response] = field(default_factory=dict, repr=False)
     _kept: dict[int, tuple[Vector, Vector]] = field(default_factory=dict, repr=False)
 
     def simulated(
@@ -206,33 +206,34 @@ class Reconstruction:
         A pattern of few coordinates acts on few modes of this sky: each of them has its own response. Several others
         have those of their fit and of what it leaves of their scores: few simulations tell their covariance.
         """
-        structure, (each, average) = self.search.grammar[member], self.search.response(member, rest)
-        theta = each[0]
+        structure, average = self.search.grammar[member], self.search.response(member, rest)
+        (theta,) = average.coordinates
         if (made := self._made_by(structure, theta)) is None:
-            found = each, average
+            found = average
         elif structure.by_coordinate:
             units = float(np.linalg.norm(theta)) * np.eye(structure.size)
-            found = units, np.stack([row for one in units if (row := self._made_by(structure, one)) is not None])
+            rows = [row for one in units if (row := self._made_by(structure, one)) is not None]
+            found = Response(units, np.stack(rows))
         elif structure.size > 1:
             found = self._fitted_out(member, rest, theta, made)
         else:
-            found = each, made[None]
+            found = Response(theta[None], made[None])
         self._trial[member] = found
         return found
 
     def _fitted_out(self, member: int, rest: Vector, theta: Vector, made: Vector) -> Response:
         """Return the response to the fit of a structure and that to what it leaves, again until that is nothing."""
         structure = self.search.grammar[member]
-        found = theta[None], made[None]
+        found = Response(theta[None], made[None])
         for number in range(1, RESPONSES):
             _, _, (amplitudes,) = self.search.judged([member], rest, [found])
-            theta, made = (amplitudes @ one for one in found)
+            theta, made = amplitudes @ found.coordinates, amplitudes @ found.made
             if number > 1 and self.search.fall(structure, rest - made) < LEFT:
                 break
             ((more, _),) = self.search.fit([structure], rest - made)
             if not theta.any() or (also := self._made_by(structure, more)) is None:
                 break
-            found = np.stack([theta, more]), np.stack([made, also])
+            found = Response(np.stack([theta, more]), np.stack([made, also]))
         return found
 
     def _made_by(self, structure: Structure, theta: Vector) -> Vector | None:
@@ -261,8 +262,8 @@ class Reconstruction:
 
     def keep(self, member: int, amplitudes: Vector) -> None:
         """Keep the coordinates that these amplitudes of the responses mean, and what they make of the scores."""
-        each, responses = self._trial[member]
-        self._kept[member] = amplitudes @ each, amplitudes @ responses
+        tried = self._trial[member]
+        self._kept[member] = amplitudes @ tried.coordinates, amplitudes @ tried.made
 
     def left(self, chosen: list[int]) -> Vector:
         """Return the scores without what the effects of structures make of them on this sky."""

@@ -9,7 +9,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,8 +45,12 @@ ALTERNATIVES = 20.0  #: odds up to which other structures are told beside the be
 RIVAL = 4.0  #: odds up to which the next one, if it is of other words, is as good a description as the best
 
 
-Response = tuple[Matrix, Matrix]
-"""Coordinates of a structure, shape (k, coordinates), and what each row makes of all scores, shape (k, P)."""
+class Response(NamedTuple):
+    """Hold what a structure makes of all scores."""
+
+    coordinates: Matrix  #: shape (k, coordinates)
+    made: Matrix  #: by each row of these, shape (k, P)
+    number: float = np.inf  #: of simulations of which it is the average; infinite: it is that on this sky
 
 
 class Sky(Protocol):
@@ -166,7 +170,7 @@ class Search:
             chosen = [one.structure for one in found]
             if sky is not None:
                 sky.keep(members[best], amplitudes[best])
-            rest = rest - amplitudes[best] @ responses[best][1] if sky is None else sky.left(chosen)
+            rest = rest - amplitudes[best] @ responses[best].made if sky is None else sky.left(chosen)
         return found
 
     def evidences(self, scores: Vector) -> Vector:
@@ -196,24 +200,27 @@ class Search:
         tops = {one.index: k for k, one in enumerate(self.grammar) if one.kind.startswith("degrees 0-")}
         return {k: powers[index] for index, k in tops.items() if index in powers and self.nulls[k] is not None}
 
-    def _evidences(self, falls: NDArray[np.float64], members: Sequence[int]) -> NDArray[np.float64]:
+    def _evidences(
+        self, falls: NDArray[np.float64], members: Sequence[int], numbers: Sequence[float] = ()
+    ) -> NDArray[np.float64]:
         """Return evidences from the falls of chi^2 of members, shape (members, n); not measured: NaN, and -inf.
 
         What a function of time is beyond its constant has a size of its own: most of a pulse is its mean, a monopole.
-        That the covariance is estimated makes a fall beside a larger one, T, larger by 1 + T/N on average (Rao, Linear
-        Statistical Inference, 8c.4). Light that channels share by their frequencies is a pattern and a power at higher
-        degrees: the more evident of the two has the evidence of both, beside noise of all degrees.
+        A covariance that N simulations tell makes a fall beside a larger one, T, larger by 1 + T/N on average (Rao,
+        Linear Statistical Inference, 8c.4); ``numbers``: N of each member, (): all. Light that channels share by their
+        frequencies is a pattern and a power at higher degrees: the more evident of the two has the evidence of both.
         """
         place, found = {k: row for row, k in enumerate(members)}, np.full(falls.shape, -np.inf)
         for row, k in enumerate(members):
             structure, constant = self.grammar[k], place.get(self.constants.get(k, -1))
             if self.nulls[k] is None:
                 continue
-            found[row] = evidence(falls[row], structure.size) - _rarity(structure)
+            odds = evidence(falls[row], structure.size)
             if constant is not None:
-                more = (falls[row] - falls[constant]) / (1.0 + np.maximum(falls[constant], 0.0) / len(self.simulations))
-                found[row] = evidence(falls[constant], 1) + evidence(more, structure.size - 1) - np.log(RARE)
-                found[row] -= _rarity(structure)
+                number = numbers[row] if numbers and not structure.of_variances else len(self.simulations)
+                more = (falls[row] - falls[constant]) / (1.0 + np.maximum(falls[constant], 0.0) / number)
+                odds = evidence(falls[constant], 1) + evidence(more, structure.size - 1) - np.log(RARE)
+            found[row] = odds - _rarity(structure)
         for pair in self.finer.items():
             if all(k in place for k in pair):
                 both = found[[place[k] for k in pair]]
@@ -265,19 +272,20 @@ class Search:
         others tell more, and all are judged in those of all.
         """
         if self.exact:
-            fits = [self._fit_on_sky(k, scores, *one) for k, one in zip(members, responses, strict=True)]
+            fits = [self._fit_on_sky(k, scores, one) for k, one in zip(members, responses, strict=True)]
         else:
-            fits = self._fits_in_all(members, scores, [made for _, made in responses])
+            fits = self._fits_in_all(members, scores, [one.made for one in responses])
         falls = np.array([fall for fall, _ in fits])
-        return self._evidences(falls[:, None], members)[:, 0], falls, [amplitudes for _, amplitudes in fits]
+        numbers = [one.number for one in responses] if self.exact else ()
+        return self._evidences(falls[:, None], members, numbers)[:, 0], falls, [amplitudes for _, amplitudes in fits]
 
-    def _fit_on_sky(self, member: int, scores: Vector, coordinates: Matrix, made: Matrix) -> tuple[float, Vector]:
+    def _fit_on_sky(self, member: int, scores: Vector, response: Response) -> tuple[float, Vector]:
         """Return fall of chi^2 and amplitudes of a structure, of whose coordinates it is known what they make.
 
         What it makes of its own scores on this sky is their variance there, which that of all skies is not where few
         modes are bright.
         """
-        structure, null = self.grammar[member], self.nulls[member]
+        structure, null, (coordinates, made, _) = self.grammar[member], self.nulls[member], response
         x, t = structure.of(scores), structure.of(made)
         if null is not None and structure.of_variances:
             fit = null.fit(x, t.T)
@@ -330,7 +338,7 @@ class Search:
         ((theta, _),) = self.fit([self.grammar[member]], scores)
         centred = self.simulations - self.simulations.mean(axis=0)
         own = self.grammar[member].of(centred) @ theta
-        return theta[None], (own @ centred / (len(centred) - 1.0))[None]
+        return Response(theta[None], (own @ centred / (len(centred) - 1.0))[None], len(centred))
 
     def fall(self, structure: Structure, scores: Vector) -> float:
         """Return the unbiased fall of chi^2 of any structure by itself; 0 of one that the maps do not measure."""

@@ -8,7 +8,7 @@ from scipy import stats
 
 from mcsim.reconstruction.grammar import ALIKE, ANY, LOWEST, Structure
 from mcsim.reconstruction.plugin import CONSTANT
-from mcsim.reconstruction.search import ALTERNATIVES, LEVEL, MOST, Search, evidence
+from mcsim.reconstruction.search import ALTERNATIVES, LEVEL, MOST, RARE, Response, Search, evidence
 
 
 def plain(stage, rows):
@@ -54,6 +54,21 @@ def test_a_pattern_is_told_from_its_mean(stage, mean, more):
     assert short > long
 
 
+def test_what_is_beside_a_mean_is_not_charged_for_a_covariance_that_nobody_estimated():
+    """A simulated response is known: falls beside a large mean are those of chi^2, not 1 + T/N times as large."""
+    simulations = np.random.default_rng(1).normal(size=(400, 9))
+    whole, mean = plain("added", range(9)), plain("added", [0])
+    chosen = replace(whole, kind=f"spin {ANY}", frame="time"), replace(mean, kind="monopole", frame="sky")
+    search, x = Search(chosen, simulations), simulations.mean(axis=0)
+    x[[0, 3]] += 20.0, 6.0
+    known = [Response(np.eye(9), np.eye(9)), Response(np.eye(1), np.eye(9)[:1])]
+    for responses, inflated in ((known, 1.0), ([search.response(k, x) for k in (0, 1)], 2.0)):
+        (long, short), falls, _ = search.judged([0, 1], x, responses)
+        assert falls[1] == pytest.approx(400.0, rel=5.0 * np.sqrt(2.0 / 400))
+        beside = (falls[0] - falls[1]) / (1.0 + (inflated - 1.0) * falls[1] / 400.0)
+        assert long - short == pytest.approx(evidence(beside, 8) - np.log(RARE))
+
+
 def test_nothing_is_found_in_data_of_the_model():
     chosen, simulations, mix = toy(400)
     search = Search(chosen, simulations)
@@ -96,11 +111,13 @@ def test_structures_are_judged_by_what_they_make_on_this_sky():
     x = 5.0 * (mix @ mix.T)[0] + simulations.mean(axis=0)
     (expected,) = search._falls(x)[:1]
     for factor, falls in ((2.0, (0.5, 0.5)), (0.5, (1.0 + 4.0 * np.sqrt(2.0 / 400), 2.0))):
-        responses = [(one, factor * made) for one, made in (search.response(k, x) for k in (0, 1))]
+        responses = [one._replace(made=factor * one.made) for one in (search.response(k, x) for k in (0, 1))]
         _, found, amplitudes = search.judged([0, 1], x, responses)
         np.testing.assert_allclose(np.concatenate(amplitudes), 1.0 / factor, rtol=0.02)
         np.testing.assert_allclose(found, expected * np.array(falls), rtol=0.02)
-        _, (nothing, _), (none, _) = search.judged([0, 1], x, [(responses[0][0], -responses[0][1]), responses[1]])
+        _, (nothing, _), (none, _) = search.judged(
+            [0, 1], x, [responses[0]._replace(made=-responses[0].made), responses[1]]
+        )
         assert (nothing, *none) == (0.0, 0.0)  # a response that is against the scores measures nothing
         _, average, _ = replace(search, exact=False).judged([0, 1], x, responses)
         np.testing.assert_allclose(average, expected, rtol=0.02)
@@ -118,7 +135,7 @@ def test_monopoles_and_dipoles_that_a_modulation_makes_count():
     made[:, :3] = 1e-3 * covariance[:3, :3]
     made[0, 8:10] = 30.0 * np.sqrt(np.diag(covariance)[8:10])
     x = mean + made[0]
-    own, own_amplitudes = search.judged([1], x, [(1e-3 * np.eye(3), 1e-3 * made)])[1:]
+    own, own_amplitudes = search.judged([1], x, [Response(1e-3 * np.eye(3), 1e-3 * made)])[1:]
     fall = made[0, 8:10] @ np.linalg.solve(covariance[8:10, 8:10], made[0, 8:10])
     assert own[0] == pytest.approx(fall, rel=0.05)
     assert own_amplitudes[0][0] == pytest.approx(1e3, rel=0.05)
