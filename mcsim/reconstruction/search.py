@@ -233,7 +233,7 @@ class Search:
 
         These are the best of every other stage, the same in other channels, splits or profiles, whose own scores do not
         tell all that they do to the others, the same function of something else and with fewer harmonics, those near
-        it, and the best of every frame. Of many among which the data choose it is the best.
+        it, and the best of every frame. Of many among which the data choose it is the best. With each stand its parts.
         """
         order = [k for k in map(int, np.argsort(-values)) if values[k] > 0.0]
         each = [self.grammar[k] for k in order]
@@ -243,7 +243,6 @@ class Search:
         if each[0].stage == "power":  # a monopole or dipole may be made of the rest of the sky
             made = (k for k, one in enumerate(self.grammar) if one.stage == "modulation")
             wanted += [k for k in made if self.nulls[k] is not None]
-        wanted += [beside[k] for beside in (self.constants, self.finer) for k in order[:1] if k in beside]
         wanted += _firsts(order, [one.stage for one in each])
         wanted += [k for k in order if each[0].elsewhere(self.grammar[k]) or each[0].like(self.grammar[k])]
         beside = [k for k in order if each[0].beside(self.grammar[k])]
@@ -251,7 +250,9 @@ class Search:
         wanted += [k for k in order if values[order[0]] - values[k] < NEAR]
         wanted += _firsts(order, [(one.stage, one.acts_on, one.frame) for one in each])
         chosen = _firsts(wanted, [self.grammar[k].choice or k for k in wanted])
-        return (chosen if self.exact else self._measurable(chosen))[:FINALISTS]
+        chosen = (chosen if self.exact else self._measurable(chosen))[:FINALISTS]
+        parts = [part[k] for part in (self.constants, self.finer) for k in chosen if k in part]
+        return list(dict.fromkeys(chosen + parts))
 
     def _measurable(self, chosen: Sequence[int]) -> list[int]:
         """Return the first of some structures of whose scores there are SPARE simulations each."""

@@ -69,6 +69,18 @@ def test_what_is_beside_a_mean_is_not_charged_for_a_covariance_that_nobody_estim
         assert long - short == pytest.approx(evidence(beside, 8) - np.log(RARE))
 
 
+def test_a_finalist_stands_beside_its_constant():
+    """A function of time far behind the best is judged in two parts like all others."""
+    simulations = np.random.default_rng(1).normal(size=(400, 20))
+    best, *others = (plain("added", [10 + k]) for k in range(10))
+    wave = replace(plain("gain", range(9)), kind=f"spin {ANY}", frame="time")
+    means = [replace(plain("gain", [0]), kind="constant"), plain("gain", [9])]
+    search = Search((best, *others, wave, *means), simulations)
+    assert search.constants == {10: 11}
+    values = np.array([30.0, *np.zeros(9), 20.0, 18.0, 19.0])
+    assert search.finalists(values) == [0, 10, 12, 11]
+
+
 def test_nothing_is_found_in_data_of_the_model():
     chosen, simulations, mix = toy(400)
     search = Search(chosen, simulations)
