@@ -218,19 +218,7 @@ def main(span="0:99", cases=CASES, first=95_000, strengths=(10.0, 20.0)):
         data = ObservedMaps(sky.context, list(sky.maps + factor * change), ask)
         found, reduction = unlisted.structures_of(data, sky.scene, sky.search, scored)
         owner = None if case.common else sky.run.channels[channel].name
-        # Of several truths that is scored with which most words of the first description are right.
-        said = [] if not found else [found[0].stage, found[0].frame, found[0].kind, found[0].split]
-
-        def agree(truth, said=said):
-            stage, frame, kinds, splits = truth
-            if not said:
-                return 0
-            right = (kinds is ANY or said[2].startswith(kinds), splits is ANY or said[3] in splits)
-            return 100 * all((said[0] == stage, said[1] == frame, *right)) + (said[0] == stage) + sum(right)
-
-        stage, frame, kinds, splits = max(case.right, key=agree)
-        split = None if splits is ANY else splits[0]
-        row("further", case.act.__name__, (stage, frame, kinds), owner, split, wanted, "", found, reduction)
+        row("further", case.act.__name__, case.right, owner, wanted, "", found, reduction)
 
 
 if __name__ == "__main__":

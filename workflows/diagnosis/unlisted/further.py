@@ -201,7 +201,7 @@ def main(span="0:99"):
         data = ObservedMaps(sky.context, list(sky.maps + factor * change), ask)
         found, reduction = unlisted.structures_of(data, sky.scene, sky.search, scored)
         owner = None if channel is None else sky.run.channels[channel].name
-        row("further", make.__name__, truth, owner, split, wanted, "", found, reduction)
+        row("further", make.__name__, [(*truth, (split,))], owner, wanted, "", found, reduction)
 
 
 if __name__ == "__main__":
