@@ -243,7 +243,7 @@ class Reconstruction:
         shape, share = structure, None
         if structure.split != ALIKE and structure.by_map:
             shape, share = replace(structure, split=ALIKE), np.zeros(len(self.scene.views))
-            share[list(structure.views)] = structure.weights
+            share[list(structure.views)] = np.sign(structure.weights)  # the shape has a power of the frequency
         effect = plugin("unlisted", shape, theta, self.scene)
         own = structure.stage == "added" and self.search.exact  # scores of what is added are the same on every sky
         return None if effect is None else self.made([effect], share, 1 if own else SKIES)

@@ -66,8 +66,8 @@ class Form(Effect):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnSky(Form):
-    """What is added to the sky, times (frequency / 94 GHz)^``index``.
+class ByFrequency(Form):
+    """What is added, times (frequency / 94 GHz)^``index``.
 
     A ``foreground`` is not in the maps of a component separation.
     """
@@ -83,7 +83,7 @@ class OnSky(Form):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AddedPattern(OnSky):
+class AddedPattern(ByFrequency):
     """A pattern fixed to the sky is added, uK."""
 
     coefficients: ClassVar[tuple[float, ...]]
@@ -95,7 +95,7 @@ class AddedPattern(OnSky):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompactSource(OnSky):
+class CompactSource(ByFrequency):
     """A compact source is added, of a flux in uK sr at 94 GHz."""
 
     lon_deg: ClassVar[float]
@@ -253,7 +253,7 @@ class InTime(Form):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AddedToSamples(InTime):
+class AddedToSamples(InTime, ByFrequency):
     """Samples have a signal added, uK, whatever the sky: a wave, a pattern in some splits, or a dipole that turns.
 
     A pattern is the sum of Q cos s psi + U sin s psi over ``spins``: of spin 0 real coefficients of a map, of others
@@ -286,7 +286,7 @@ class AddedToSamples(InTime):
             value = np.array(self.coefficients) @ np.array(self.components(time_s, theta, phi, psi, site))
         else:
             value = self.over_time(time_s, psi, site)
-        return np.asarray(self.amplitude * self.factor(time_s, site) * value)
+        return np.asarray(self.amplitude * self.seen(site) * self.factor(time_s, site) * value)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -433,8 +433,11 @@ def _modulations(scene: Scene) -> Iterator[Structure]:
 def _scaled(scene: Scene) -> Iterator[Structure]:
     """Yield what is added to all channels in proportion to a power of the frequency, but to separated components."""
     for k, (index, scaling) in enumerate(scene.scalings.items()):
-        for stage, acts_on, frame, kind, keys, mix in _added(scene):
-            rows, tried = _rows(scene, keys, scene.shared), _tried(scene, kind)
-            yield Structure(stage, acts_on, frame, kind, None, ALIKE, index, rows, scaling, mix, scene.shared, tried)
+        for split, factors in _splits(scene.splits):
+            weights = scaling * [factors[scene.views[i].split] for i in scene.shared]
+            views, weights = tuple(np.array(scene.shared)[weights != 0.0].tolist()), weights[weights != 0.0]
+            for stage, acts_on, frame, kind, keys, mix in _added(scene):
+                own = None, split, index, _rows(scene, keys, views), weights, mix, views, _tried(scene, kind)
+                yield Structure(stage, acts_on, frame, kind, *own)
         keys = [("summed", k, b) for b in range(len(scene.fine) - 1)]
         yield replace(_plain(scene, "added", "sky", "power", None, keys), index=index)

@@ -129,7 +129,7 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
         case "added", "sky" if structure.kind != "power":
             if alike:
                 return "AddedPattern", {"coefficients": pattern, **scaled}
-            return "AddedToSamples", {"wave": "sky", "coefficients": pattern, **splits}
+            return "AddedToSamples", {"wave": "sky", "coefficients": pattern, **splits, **scaled}
         case "added", "spacecraft" | "time" | "Sun":
             return "AddedToSamples", timed
         case "gain", "time" | "spacecraft" if structure.acts_on == "sky and dipole":

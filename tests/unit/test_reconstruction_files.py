@@ -9,15 +9,8 @@ import healpy
 import numpy as np
 import pytest
 
-from instruments import two_channels
-from mcsim import config
-from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import model_of
-from mcsim.reconstruction import simulated_scores, words
-from mcsim.reconstruction.grammar import ALIKE, Structure, structures
+from mcsim.reconstruction.grammar import ALIKE, Structure
 from mcsim.reconstruction.plugin import Plugin, plugin
-from mcsim.simulation import simulate
-from mcsim.simulation.survey import survey
 from mcsim.systematics.sky import Boost
 
 
@@ -62,22 +55,3 @@ def test_lines_of_sight_are_told_apart_whatever_the_channels_are_called(names):
     scene = SimpleNamespace(channels=("V1", *names), splits=("half1", "half2"), timed=True, frame="ecliptic")
     (made, other) = (plugin("unlisted_1", one, np.array([0.1, 0.2, 0.3]), scene) for one in found)
     assert made.values["coefficients"] == other.values["coefficients"] == (0.1, 0.2, 0.3)
-
-
-def test_foregrounds_are_in_all_maps_but_those_of_a_component_separation():
-    """Beside these what V1 and W1 have alike is told, too, which without them would be the sky itself."""
-    table = two_channels("foregrounds", lmax=16, nside=8, fwhm_arcmin=600.0, period_s=3011.0)
-    table["channel"].append(table["channel"][0] | {"name": "CMB", "frequency_ghz": 143.0, "foregrounds": False})
-    run = config.load(table)
-    scene = simulated_scores.scene_of(model_of(survey(run, orders=2), DiagnosisSettings()))
-    for index, says in ((0.0, "alike in these"), (1.5, "as the frequency to the power 1.5")):
-        (found,) = (one for one in structures(scene) if (one.kind, one.index) == ("quadrupole", index))
-        assert found.views == (0, 1, 2, 3)
-        assert says in words.says(found, np.ones(5), scene)
-        kind = plugin("unlisted_1", found, np.ones(5), scene).kind()
-        effect = config.Effect(name="unlisted_1", parameters={"amplitude": 1.0})
-        acting = survey(replace(run, effects=(effect,)), library={"unlisted_1": kind})
-        pairs = zip(simulate.maps(acting, 0), simulate.maps(survey(run), 0), strict=True)
-        v1, _, w1, _, *cmb = (np.std(one - other) for one, other in pairs)
-        assert w1 / v1 == pytest.approx((94.0 / 61.0) ** index, rel=0.01)  # samples have other places
-        assert max(cmb) == 0.0

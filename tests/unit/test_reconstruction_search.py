@@ -81,6 +81,15 @@ def test_a_finalist_stands_beside_its_constant():
     assert search.finalists(values) == [0, 10, 12, 11]
 
 
+def test_a_pattern_has_finer_power_where_splits_see_it_alike():
+    simulations = np.random.default_rng(1).normal(size=(400, 12))
+    light = {"channel": None, "index": -3.0, "frame": "sky"}
+    alike = replace(plain("added", range(9)), kind="degrees 0-2", **light)
+    power = replace(plain("added", range(9, 12)), kind="power", **light)
+    search = Search((alike, replace(alike, split="half2"), power), simulations)
+    assert search.finer == {0: 2}
+
+
 def test_nothing_is_found_in_data_of_the_model():
     chosen, simulations, mix = toy(400)
     search = Search(chosen, simulations)

@@ -1,0 +1,60 @@
+"""Light that channels share by their frequencies: where it is, and how its scores are measured."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from instruments import two_channels
+from mcsim import config
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.wiener_filter import model_of, wiener_filter
+from mcsim.reconstruction import simulated_scores, words
+from mcsim.reconstruction.grammar import ALIKE, structures
+from mcsim.reconstruction.plugin import plugin
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+
+SMALL = {"lmax": 16, "nside": 8, "fwhm_arcmin": 600.0, "period_s": 3011.0}
+
+
+def test_foregrounds_are_in_all_maps_but_those_of_a_component_separation():
+    """Beside these what V1 and W1 have alike is told, too, which without them would be the sky itself."""
+    table = two_channels("foregrounds", **SMALL)
+    table["channel"].append(table["channel"][0] | {"name": "CMB", "frequency_ghz": 143.0, "foregrounds": False})
+    run = config.load(table)
+    scene = simulated_scores.scene_of(model_of(survey(run, orders=2), DiagnosisSettings()))
+    for index, says in ((0.0, "alike in these"), (1.5, "as the frequency to the power 1.5")):
+        told = ("quadrupole", None, ALIKE, index)
+        (found,) = (one for one in structures(scene) if one.says[3:] == told)
+        assert found.views == (0, 1, 2, 3)
+        assert says in words.says(found, np.ones(5), scene)
+        kind = plugin("unlisted_1", found, np.ones(5), scene).kind()
+        effect = config.Effect(name="unlisted_1", parameters={"amplitude": 1.0})
+        acting = survey(replace(run, effects=(effect,)), library={"unlisted_1": kind})
+        pairs = zip(simulate.maps(acting, 0), simulate.maps(survey(run), 0), strict=True)
+        v1, _, w1, _, *cmb = (np.std(one - other) for one, other in pairs)
+        assert w1 / v1 == pytest.approx((94.0 / 61.0) ** index, rel=0.01)  # samples have other places
+        assert max(cmb) == 0.0
+
+
+@pytest.mark.parametrize("split", ["half2", "opposite"])
+def test_it_may_differ_between_halves(split):
+    """The score of a pattern in some splits is the product of residuals and what its effect adds there."""
+    run = config.load(two_channels("halves", lmax=24, nside=16, fwhm_arcmin=300.0, period_s=311.0))
+    model = model_of(survey(run, orders=2), DiagnosisSettings())
+    maps, scene = list(simulate.maps(model.survey, 7)), simulated_scores.scene_of(model)
+    filtered, u = wiener_filter(model, maps), simulated_scores.scores_of_maps(model, scene, maps)
+    told = ("degrees 0-2", None, split, -3.0)
+    (structure,) = (one for one in structures(scene) if one.says[3:] == told)
+    theta = np.random.default_rng(7).normal(size=structure.size)
+    kind = plugin("unlisted_1", structure, theta, scene).kind()
+    effect = config.Effect(name="unlisted_1", parameters={"amplitude": 1.0})
+    acting = survey(replace(run, effects=(effect,)), library={"unlisted_1": kind})
+    pairs = zip(simulate.maps(acting, 0), simulate.maps(survey(run), 0), strict=True)
+    added = [one - other for one, other in pairs]
+    assert np.std(added[1]) == pytest.approx((94.0 / 61.0) ** 3 * np.std(added[3]), rel=0.02)
+    assert (split == "half2") == (not np.any(added[0]) and not np.any(added[2]))
+    products = list(zip(filtered.residual, added, strict=True))
+    scale = np.sqrt(sum(r @ r * (one @ one) for r, one in products) / added[0].size)
+    assert abs(sum(r @ one for r, one in products) - theta @ structure.of(u)) < 0.05 * scale
