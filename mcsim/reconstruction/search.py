@@ -230,9 +230,9 @@ class Search:
     def finalists(self, values: Vector) -> list[int]:
         """Return structures to compare: the most evident one, and those that may be it on this sky.
 
-        These are the best of every other stage, the same in other channels, splits or profiles, whose own scores do not
-        tell all that they do to the others, the same function of something else and with fewer harmonics, those near
-        it, and the best of every frame. Of many among which the data choose it is the best. With each stand its parts.
+        These are the best of every other stage, the same in other channels, splits or profiles, the same function of
+        something else and with fewer harmonics, those near it, and the best of every frame, without a constant and with
+        one. Of many among which the data choose it is the best. Its parts stand with each.
         """
         order = [k for k in map(int, np.argsort(-values)) if values[k] > 0.0]
         each = [self.grammar[k] for k in order]
@@ -240,14 +240,14 @@ class Search:
             return [int(np.argmax(values))]
         wanted = order[:1]
         if each[0].stage == "power":  # a monopole or dipole may be made of the rest of the sky
-            made = (k for k, one in enumerate(self.grammar) if one.stage == "modulation")
-            wanted += [k for k in made if self.nulls[k] is not None]
+            wanted += [k for k, null in enumerate(self.nulls) if null and self.grammar[k].stage == "modulation"]
         wanted += _firsts(order, [one.stage for one in each])
         wanted += [k for k in order if each[0].elsewhere(self.grammar[k]) or each[0].like(self.grammar[k])]
         beside = [k for k in order if each[0].beside(self.grammar[k])]
         wanted += _firsts(beside, [(self.grammar[k].acts_on, self.grammar[k].in_any_way) for k in beside])
         wanted += [k for k in order if values[order[0]] - values[k] < NEAR]
-        wanted += _firsts(order, [(one.stage, one.acts_on, one.frame) for one in each])
+        labels = [(one.stage, one.acts_on, one.frame, k in self.constants) for k, one in zip(order, each, strict=True)]
+        wanted += _firsts(order, labels)
         chosen = _firsts(wanted, [self.grammar[k].choice or k for k in wanted])
         chosen = (chosen if self.exact else self._measurable(chosen))[:FINALISTS]
         parts = [part[k] for part in (self.constants, self.finer) for k in chosen if k in part]

@@ -70,15 +70,16 @@ def test_what_is_beside_a_mean_is_not_charged_for_a_covariance_that_nobody_estim
 
 
 def test_a_finalist_stands_beside_its_constant():
-    """A function of time far behind the best is judged in two parts like all others."""
+    """A function of time far behind the best is judged in two parts like all others, and beside those of one part."""
     simulations = np.random.default_rng(1).normal(size=(400, 20))
     best, *others = (plain("added", [10 + k]) for k in range(10))
     wave = replace(plain("gain", range(9)), kind=f"spin {ANY}", frame="time")
+    once = replace(plain("gain", [3]), kind="spin 1", frame="time")
     means = [replace(plain("gain", [0]), kind="constant"), plain("gain", [9])]
-    search = Search((best, *others, wave, *means), simulations)
-    assert search.constants == {10: 11}
-    values = np.array([30.0, *np.zeros(9), 20.0, 18.0, 19.0])
-    assert search.finalists(values) == [0, 10, 12, 11]
+    search = Search((best, *others, wave, once, *means), simulations)
+    assert search.constants == {10: 12}
+    values = np.array([30.0, *np.zeros(9), 20.0, 21.0, 18.0, 19.0])
+    assert search.finalists(values) == [0, 11, 10, 13, 12]
 
 
 def test_a_pattern_has_finer_power_where_splits_see_it_alike():
