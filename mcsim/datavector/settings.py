@@ -12,7 +12,7 @@ from mcsim.systematics import Library
 _FIRST = {
     "sims_per_element": 2,
     "pilot_sims_per_element": 2,
-    "worth_per_element": 8.0,
+    "worth_per_element": 7.0,
     "channel_skies": 2,
     "typical_skies": 3,
     "common_skies": 6,
