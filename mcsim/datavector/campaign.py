@@ -349,7 +349,8 @@ def _needed(settings: DiagnosisSettings, elements: int) -> int:
 def _too_few(source: Source, independent: int, each: int) -> InputError:
     return InputError(
         f"{source.count} realizations of {source.label} are too few for a data vector of {independent} independent "
-        f"elements; give {each * independent}, {each} for each, or leave effects out (--without)."
+        f"elements; give {each * independent}, {each} for each, leave effects out (--without), or take the covariance "
+        f"of this sample (--simulations {source.count}), which keeps less of every signal-to-noise ratio."
     )
 
 
