@@ -155,12 +155,15 @@ def _total(found: NDArray | None, terms: Terms, mean: Callable[[Effect], NDArray
 
 
 def _along_bases(acting: Sequence[Effect], values: Callable[[Effect], Map]) -> tuple[Terms, tuple[Effect, ...]]:
-    """Return the effects of bases whose sum some effects are, by their values at some samples, and the others."""
+    """Return the effects of bases whose sum some effects are, by their values at some samples, and the others.
+
+    Those that do nothing at these samples are among the others.
+    """
     terms, others = Terms(), []
     for effect in acting:
         own, wanted = _along_basis(effect), values(effect)
         missed = wanted - np.sum([factor * values(one) for factor, one in own], axis=0)
-        if float(np.abs(missed).max()) <= LINEAR * float(np.abs(wanted).max()):
+        if wanted.any() and float(np.abs(missed).max()) <= LINEAR * float(np.abs(wanted).max()):
             terms += own
         else:
             others.append(effect)

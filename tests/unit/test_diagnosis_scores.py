@@ -69,6 +69,31 @@ class SaturatedDrift(systematics.Effect):
         return np.tanh(300.0 * self.amplitude * np.cos(2.0 * np.pi * time_s / 3.15e7)) if self.amplitude else None
 
 
+@dataclass(frozen=True, kw_only=True)
+class ShortStep(systematics.Effect):
+    """A gain that is higher by a thousandth for so many seconds, and at none of the times that are looked at."""
+
+    name = "short_step"
+    scope = "channel"
+    unit = "s"
+    cause = signature = source = "none"
+    step = 200.0
+
+    def gain(self, time_s: NDArray[np.float64], site: systematics.Site) -> NDArray[np.float64] | None:
+        return 1e-3 * ((time_s > 3851.0 * 1000.2) & (time_s < 3851.0 * 1000.2 + self.amplitude))
+
+
+@pytest.mark.slow
+def test_gain_that_is_nothing_at_the_times_that_are_looked_at_takes_a_pass(site: systematics.Site) -> None:
+    step = ShortStep(amplitude=1500.0)
+    assert not pixel_means._gains(step, site, HALVES[0]).any()
+    found = pixel_means.gain_of_all((step,), site, HALVES[0])
+    expected = mean_gain((step,), site, HALVES[0])
+    assert expected is not None
+    assert expected[0].any()
+    np.testing.assert_array_equal(found, expected)
+
+
 @pytest.mark.slow
 def test_drifts_of_all_amplitudes_take_two_passes(monkeypatch: pytest.MonkeyPatch, site: systematics.Site) -> None:
     """One for each phase that spans the others; a gain that is not linear takes one of its own."""
