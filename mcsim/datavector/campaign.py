@@ -309,7 +309,8 @@ def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool
     size, settings = len(analysis.elements), analysis.settings
     few, source = settings.pilot_sims_per_element * size, analysis.source
     stored = None if source is None else source.count
-    if settings.shrinks(None) and stored is None:
+    ends_early = settings.shrinks(None) and stored is None
+    if ends_early:
         few = min(few, max(LOOKED_AT, math.ceil(LEAST * size)))
     # What is needed in any case keeps workers busy to the end of the pilot; external simulations wait for its verdict.
     found = run([one for one in jobs if (one.number < few if one.kind == "null" else source is None)])
@@ -321,12 +322,12 @@ def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool
     enough = _needed(settings, independent)
     if source is not None and stored is not None and stored < settings.sims_per_element * independent:
         raise _too_few(source, independent, settings.sims_per_element)
-    if settings.shrinks(None) and stored is None:
-        while LOOKED_AT <= few < enough and _worth(analysis, drawn) < settings.worth_per_element * independent:
+    if ends_early and few >= LOOKED_AT:
+        while few < enough and _worth(analysis, drawn) < settings.worth_per_element * independent:
             few += math.ceil(STEP * independent)
             found |= run([one for one in jobs if one not in found and one.kind == "null" and one.number < few])
             drawn = _drawn(found, size)
-        enough = min(few, enough) if few >= LOOKED_AT else enough
+        enough = min(few, enough)
     found |= run([one for one in jobs if one not in found and (one.kind != "null" or one.number < enough)])
     return {purpose: found[purpose] for purpose in jobs if purpose in found}
 
