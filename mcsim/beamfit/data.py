@@ -167,11 +167,11 @@ def from_store(path: str | Path, selection: Selection = EVERYTHING) -> Measureme
 
 
 def refuse_filtered(path: str | Path, name: str) -> None:
-    """Raise InputError for spectra that a filter has made, whose response to a beam is not that of the templates."""
+    """Raise InputError for spectra that a filter has made: response and scatter are not those of other maps."""
     if name != "none":
         raise InputError(
             f"{path} has spectra of maps with filter = {name!r}, whose response to a beam is not that of the fitted "
-            'templates; run them with biposh.filter = "none", and fit those.'
+            'templates; run them with biposh.filter = "none", and take those.'
         )
 
 
@@ -179,9 +179,11 @@ def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None
     """Return the data of a measurement with the covariance of one realization of an ensemble that models it.
 
     The measurement is usually from a table, whose own errors are not used. ``pair`` is a label of the store; by default
-    that of the measurement, or the store's first. InputError if the store lacks a mode or degree of the measurement.
+    that of the measurement, or the store's first. InputError if the store lacks a mode or degree of the measurement, or
+    filters its maps.
     """
     with opening.open_ensemble(path) as ensemble:
+        refuse_filtered(path, ensemble.attrs["configuration"]["biposh"].get("filter", "none"))
         labels = [str(name) for name in ensemble["pair"].values]
     label = pair or (measured.pair if measured.pair in labels else labels[0])
     drawn = realizations(path, measured.rows, measured.scaling, measured.kind, label, measured.highest)

@@ -219,20 +219,26 @@ def measurement(
     a measurement, which has its selection.
     ``source``, ``selection``: configuration, whose frame the data must have, and the modes, multipoles, kind and pair
     that are fitted. ``covariance``: store that models the data: the covariance of one of its realizations replaces that
-    of the data. Raise InputError for data that cannot be read, lack what is selected, or are in another frame than the
-    configuration.
+    of the data. Raise InputError for data that cannot be read or lack what is selected, and for data or a covariance in
+    another frame than the configuration, or of filtered maps.
     """
     if isinstance(data, Measurement):
         if selection != EVERYTHING:
             raise InputError("a measurement holds what is fitted; give the selection to what reads it, or none here.")
-        return data if covariance is None else with_covariance_of(data, covariance)
+        return data if covariance is None else _with_covariance_of(data, covariance, None, survey_of(source).frame)
     path, frame = user_path(data), survey_of(source).frame
     if path.is_dir():
         measured = from_store(path, selection)
         check_frame(path, frame_of(store.attributes(path)["configuration"]), frame)
     else:
         measured = read_table(path, frame, selection, errors=covariance is None)
-    return measured if covariance is None else with_covariance_of(measured, covariance, selection.pair)
+    return measured if covariance is None else _with_covariance_of(measured, covariance, selection.pair, frame)
+
+
+def _with_covariance_of(measured: Measurement, path: str | Path, pair: str | None, frame: str) -> Measurement:
+    """Return a measurement with the covariance of a store; InputError if that is in another frame."""
+    check_frame(path, frame_of(store.attributes(user_path(path))["configuration"]), frame)
+    return with_covariance_of(measured, path, pair)
 
 
 def _unseen(design: NDArray[np.float64], measured: Measurement) -> bool:

@@ -8,6 +8,9 @@ import xarray as xr
 from distributed import Client
 
 from mcsim import config, fit, merge, open_ensemble, open_summary, predict, run
+from mcsim.beamfit import Measurement, measurement
+from mcsim.beamfit.data import SUMMARY, Row
+from mcsim.bipolar import parse_mode
 from mcsim.ensemble import plan
 from mcsim.ensemble.tables import write
 from mcsim.simulation import simulate
@@ -157,3 +160,13 @@ def test_a_fit_refuses_filtered_coefficients(table, store: Path, tmp_path: Path)
     for data in (store, tmp_path / "table.ecsv"):
         with refused("inverse_covariance", "biposh.filter"):
             fit(data, table)
+
+
+def test_a_fit_takes_no_covariance_of_filtered_maps_or_of_another_frame(table, store: Path) -> None:
+    """Their scatter is not that of the data: with errors of either a fit would be confident for no reason."""
+    row = Row(parse_mode("L1M0d1"), 2, 11, True)
+    measured = Measurement("data", None, "plain", (row,), SUMMARY, np.ones(1), np.eye(1), None)
+    with refused(store, "inverse_covariance", "biposh.filter"):
+        measurement(measured, table, covariance=store)
+    with refused(store, "ecliptic", "galactic"):
+        measurement(measured, table | {"map": {"nside": 16, "frame": "galactic"}}, covariance=store)
