@@ -98,5 +98,6 @@ def look_at_scan(
     with reporting("orientation moments", 1.0, "", quiet=False) as report:
         folder = scan.cached_moments(loaded, scan.MapGrid(nside, frame), smax, os.cpu_count() or 1, report)
     moments = scan.Moments.load(folder)
-    alone = loaded if frame == "ecliptic" and line_of_sight is None and len(loaded.default_lines) == 1 else None
-    return Look(loaded.name, scan.summary(loaded.name, moments), scan_figure(moments, loaded.name, alone))
+    alone = frame == "ecliptic" and line_of_sight is None and len(loaded.default_lines) == 1
+    beside = loaded if alone and scan.has_limit(loaded) else None
+    return Look(loaded.name, scan.summary(loaded.name, moments), scan_figure(moments, loaded.name, beside))

@@ -283,6 +283,14 @@ def test_scan(mcsim: Command, tmp_path: Path) -> None:
     assert (tmp_path / "scan.png").stat().st_size > 10_000
 
 
+def test_scan_without_a_limit(mcsim: Command, tmp_path: Path) -> None:
+    """Planck precesses with the seasons, so there is no curve of endless time to draw beside its own."""
+    code, out, _ = mcsim("scan", "planck", "--nside", 8, "--sample-period-s", 607.0, "-o", "scan.png")
+    assert code == 0
+    assert "three factors" in out
+    assert (tmp_path / "scan.png").stat().st_size > 10_000
+
+
 def test_predict_plot_and_fit(mcsim: Command, small_store: Path, tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(SMALL)
     code, out, _ = mcsim("predict", "small.toml", "--snr", "-o", "expected.ecsv")

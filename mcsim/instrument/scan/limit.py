@@ -115,9 +115,15 @@ def graded_rule(
     return theta[weight > 0.0], weight[weight > 0.0]
 
 
+def has_limit(model: ScanModel) -> bool:
+    """Return True unless a model precesses too slowly for a long-time limit."""
+    fast = model.orbit_period_s >= _FAST_PRECESSION * abs(model.precession_period_s)
+    return model.precession_angle_deg == 0.0 or fast
+
+
 def _line(model: ScanModel) -> LineOfSight:
     """Return the first default line of sight; InputError if its model precesses too slowly for such a limit."""
-    if model.precession_angle_deg > 0.0 and model.orbit_period_s < _FAST_PRECESSION * abs(model.precession_period_s):
+    if not has_limit(model):
         raise InputError(
             f"scan model {model.name!r} precesses {model.orbit_period_s / abs(model.precession_period_s):.3g} times an "
             f"orbit, but the long-time limit needs more than {_FAST_PRECESSION:g}; stream its moments instead."
