@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.wcs import WCS
 
 from harmonics import legendre
 from mcsim import config
@@ -285,6 +286,22 @@ def test_unusable_map_is_refused(tmp_path, change, options, named) -> None:
         Beam.from_map(read_map(path, **options), **{"lmax": 100, **degrees})
 
 
+def test_steps_in_a_matrix_are_those_of_the_pixels(tmp_path) -> None:
+    """astropy writes a matrix CD as PC beside CDELT = 1, which made pixels of a degree of any."""
+    wcs = WCS(naxis=2)
+    wcs.wcs.cd, wcs.wcs.cunit = np.diag([0.04, 0.04]), ["deg", "deg"]
+    written = wcs.to_header()
+    assert (written["CDELT1"], written["PC1_1"]) == (1.0, 0.04)
+    for name, header in [
+        ("plain.fits", {"CDELT1": 0.04, "CDELT2": 0.04}),
+        ("pc.fits", dict(written)),
+        ("cd.fits", {"CD1_1": 0.04, "CD2_2": 0.04}),
+        ("both.fits", {"CDELT1": 1.0, "CDELT2": 1.0, "CD1_1": 0.04, "CD2_2": 0.04}),
+    ]:
+        found = read_map(write(tmp_path / name, small_image(), pixel_deg=None, **header))
+        assert found.pixel_rad == pytest.approx(np.radians(0.04), rel=1e-12)
+
+
 def test_unusable_headers_are_refused(tmp_path) -> None:
     image = small_image()
     bare = write(tmp_path / "bare.fits", image, pixel_deg=None)
@@ -293,6 +310,7 @@ def test_unusable_headers_are_refused(tmp_path) -> None:
     radians = write(tmp_path / "radians.fits", image, CUNIT1="rad")
     turned = write(tmp_path / "turned.fits", image, CROTA2=30.0)
     matrix = write(tmp_path / "matrix.fits", image, PC1_2=-0.5, PC2_1=0.5)
+    flipped = write(tmp_path / "flipped.fits", image, PC1_1=-1.0)
     cube = write(tmp_path / "cube.fits", np.stack([image, image]))
     line = write(tmp_path / "line.fits", image[20])
     for path, named in [
@@ -302,6 +320,7 @@ def test_unusable_headers_are_refused(tmp_path) -> None:
         (radians, ("radians.fits", "CUNIT1", "rad")),
         (turned, ("turned.fits", "CROTA2", 30.0, "pixel_deg")),
         (matrix, ("matrix.fits", "PC1_2", -0.5, "pixel_deg")),
+        (flipped, ("flipped.fits", -0.04, 0.04)),
         (line, ("line.fits", 1)),
         (tmp_path / "absent.fits", ("absent.fits",)),
     ]:

@@ -280,19 +280,23 @@ def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Heade
 
 
 def _pixel_deg(header: fits.Header, path: str | Path) -> float:
-    if "CDELT1" not in header or "CDELT2" not in header:
+    if any(f"CDELT{axis}" not in header and f"CD{axis}_{axis}" not in header for axis in (1, 2)):
         raise InputError(f"{path} has no CDELT1 and CDELT2: give pixel_deg, the side of a pixel in degrees")
-    step_x, step_y = float(header["CDELT1"]), float(header["CDELT2"])
+    # A matrix CD takes the place of CDELT, and a matrix PC multiplies it: astropy writes steps there, and CDELT = 1.
+    step_x, step_y = (
+        float(header.get(f"CD{axis}_{axis}", header.get(f"CDELT{axis}", 0.0) * header.get(f"PC{axis}_{axis}", 1.0)))
+        for axis in (1, 2)
+    )
     for axis in ("CUNIT1", "CUNIT2"):
         unit = str(header.get(axis, "deg")).strip().lower()
         if unit not in ("", "deg", "degree", "degrees"):
             raise InputError(f"{path} has {axis} = {unit!r} where degrees are expected: give pixel_deg")
     if not (step_x > 0 and abs(step_y - step_x) <= 1e-6 * step_x):
         raise InputError(
-            f"{path} has CDELT1 = {step_x:g} and CDELT2 = {step_y:g}, which must be equal and positive: "
+            f"{path} has steps of {step_x:g} and {step_y:g} deg (CDELT1, CDELT2), which must be equal and positive: "
             "resample or flip the image so that columns follow the beam's x, or give pixel_deg"
         )
-    for key in ("CROTA1", "CROTA2", "PC1_2", "PC2_1"):
+    for key in ("CROTA1", "CROTA2", "PC1_2", "PC2_1", "CD1_2", "CD2_1"):
         if header.get(key):
             raise InputError(
                 f"{path} has {key} = {header[key]}, but its columns must follow the beam's x: turn the image, or give "
