@@ -9,12 +9,13 @@ import healpy
 import numpy as np
 
 from mcsim.datavector.wiener_filter import Model, Part, sky_variance
+from mcsim.ensemble.external_maps import in_uk
 from mcsim.ensemble.maps import POINTING, file_names, first_realization
 from mcsim.errors import InputError
 from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.sphere.header import first_table, opened
 from mcsim.sphere.healpix import read_uk
-from mcsim.support.arrays import Map, reals
+from mcsim.support.arrays import Map
 from mcsim.support.folders import user_path
 
 
@@ -90,7 +91,10 @@ def of_pixel_means(model: Model, folder: str | Path) -> bool:
 
 
 def checked(model: Model, maps: Sequence[Map] | Mapping[str, Map]) -> list[Map]:
-    """Check maps given as arrays, uK, by name or in the order of the model's, like those of a folder."""
+    """Check given maps, by name or in the order of the model's, like those of a folder; uK, or as their attributes say.
+
+    InputError as well for attributes ``frame`` or ``ordering`` that are not the model's and RING.
+    """
     names = [part.name for part in model.parts]
     if isinstance(maps, Mapping):
         lacking = [name for name in names if name not in maps]
@@ -103,10 +107,10 @@ def checked(model: Model, maps: Sequence[Map] | Mapping[str, Map]) -> list[Map]:
     if len(maps) != len(model.parts):
         raise InputError(f"{len(maps)} maps were given, the model has {len(model.parts)}; give one for each.")
     named = [(part, f"map {part.name}") for part in model.parts]
-    found = [
-        checked_map(model, part, reals(map_, name, healpy.UNSEEN), name)
-        for (part, name), map_ in zip(named, maps, strict=True)
-    ]
+    found = []
+    for (part, name), map_ in zip(named, maps, strict=True):
+        frequency_ghz = model.survey.channels[part.channel].site.frequency_ghz
+        found.append(checked_map(model, part, in_uk(map_, name, model.frame, frequency_ghz), name))
     _check_differ(model, found, [name for _, name in named])
     return found
 

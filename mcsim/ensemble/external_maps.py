@@ -76,7 +76,8 @@ def in_order(given: Any, parts: Sequence[Part], where: str) -> list[Map]:
     """Return maps in the order of the parts, uK; InputError if one is missing, or is no array of numbers.
 
     ``given``: mappings, xarray objects, or both nested: channel, then split. Names may be ``W1:half1``, ``W1/half1`` or
-    ``W1_half1``, and an attribute ``units`` says another unit.
+    ``W1_half1``. An attribute ``units`` says another unit; ``frame`` and ``ordering`` are those of the parts and RING,
+    or missing.
     """
     names = {alias: part for part in parts for alias in (part.name, *(part.name.replace(":", s) for s in "/_"))}
     if len(parts) == 1:
@@ -85,7 +86,8 @@ def in_order(given: Any, parts: Sequence[Part], where: str) -> list[Map]:
     for labels, one in _flat(given):
         part = names.get(":".join(labels))
         if part is not None:
-            found[part.name] = _in_uk(one, part, where)
+            name = f"the map {part.name} of {where}"
+            found[part.name] = in_uk(one, name, part.frame, part.frequency_ghz)
     missing = [part.name for part in parts if part.name not in found]
     if missing:
         there = ", ".join(":".join(labels) or "an unnamed map" for labels, _ in _flat(given)) or "none"
@@ -116,10 +118,21 @@ def _flat(given: Any, labels: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str,
         yield labels, given
 
 
-def _in_uk(one: Any, part: Part, where: str) -> Map:
-    found = reals(one, f"the map {part.name} of {where}", healpy.UNSEEN)
-    unit = getattr(one, "attrs", {}).get("units")
-    factor = header.to_uk(unit, Path(f"the map {part.name} of {where}"), part.frequency_ghz)
+def in_uk(one: Any, name: str, frame: str, frequency_ghz: float | None) -> Map:
+    """Return a given map in uK, ``healpy.UNSEEN`` where not observed; its attribute ``units`` may say another unit.
+
+    ``name`` names it in messages. InputError for no array of numbers, or if its attributes ``frame`` or ``ordering``
+    say another frame or another order than RING.
+    """
+    said = getattr(one, "attrs", {})
+    found = reals(one, name, healpy.UNSEEN)
+    factor = header.to_uk(said.get("units"), Path(name), frequency_ghz)
+    stated = header.frame_named(said.get("frame"), name, "frame")
+    if stated not in (None, frame):
+        raise InputError(f"{name} is in {stated} coordinates, but the model is {frame}; rotate it first.")
+    order = str(said.get("ordering", "RING")).strip().upper()
+    if order != "RING":
+        raise InputError(f"{name} has ordering = {order!r}, but maps in memory and stores are RING; reorder it first.")
     return np.where((found > UNSEEN_BELOW) | ~np.isfinite(found), factor * found, healpy.UNSEEN)
 
 

@@ -68,8 +68,8 @@ def read_coefficients(path: Path, what: str) -> tuple[Alm, int, fits.Header]:
         return packed, int(mmax), table.header
 
 
-def frame_named(coordsys: object, where: str) -> str | None:
-    """Return the frame that a COORDSYS keyword of a file, ``where``, names; None if it is missing or empty.
+def frame_named(coordsys: object, where: str, key: str = "COORDSYS") -> str | None:
+    """Return the frame that a keyword ``key`` of a file, ``where``, names; None if it is missing or empty.
 
     Raise InputError for a word that names none of the three frames.
     """
@@ -79,7 +79,7 @@ def frame_named(coordsys: object, where: str) -> str | None:
     for frame, words in _FRAMES.items():
         if word in words:
             return frame
-    raise InputError(f"{where} has COORDSYS = {coordsys!r}, but it must be E, G or C (ecliptic, galactic, equatorial).")
+    raise InputError(f"{where} has {key} = {coordsys!r}, but it must be E, G or C (ecliptic, galactic, equatorial).")
 
 
 def radians(unit: str) -> float:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import healpy
 import numpy as np
 import pytest
+import xarray as xr
 
 import mcsim
 from instruments import data_of, two_channels
@@ -141,3 +142,16 @@ def test_a_map_that_the_model_has_not_is_told(small, folder):
     named = dict(zip((part.name for part in small.model.parts), maps, strict=True))
     with pytest.warns(UserWarning, match="W7:half1"):
         assert len(checked(small.model, named | {"W7:half1": maps[0]})) == len(maps)
+
+
+def test_given_maps_are_in_the_units_and_the_frame_that_their_attributes_say(small: Analysis) -> None:
+    """Rows of a store say both: a map of another frame was taken as it was, and a unit refused by the size."""
+    maps, own, other = simulate.maps(data_of(small.run), 0), small.model.frame, "equatorial"
+    said = [
+        xr.DataArray(np.where(m == healpy.UNSEEN, m, m / 1000.0), dims="pixel", attrs={"units": "mK", "frame": own})
+        for m in maps
+    ]
+    for found, expected in zip(checked(small.model, said), maps, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+    with refused(other, own):
+        checked(small.model, [one.assign_attrs(frame=other) for one in said])

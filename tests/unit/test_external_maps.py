@@ -1,10 +1,12 @@
-"""Stored maps of another program: which files a template names."""
+"""Stored maps of another program: which files a template names, and what their attributes say."""
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+import xarray as xr
 
-from mcsim.ensemble.external_maps import Part, fits_maps
+from mcsim.ensemble.external_maps import Part, fits_maps, in_order
 from refusals import refused
 
 PARTS = (Part("V", "V", None, None, "galactic"),)
@@ -38,3 +40,16 @@ def test_a_file_with_other_digits_is_not_left_out_in_silence(field: str, names: 
     template = "/".join(["{realization:05d}", "V_{realization:05d}.fits"] if "/" in names[0] else [f"V_{field}.fits"])
     with refused(names[0], "{realization}", "{realization:05d}"):
         fits_maps(PARTS, str(tmp_path / template))
+
+
+def test_maps_of_another_frame_or_order_are_refused() -> None:
+    """The stores of a run say both; a galactic ensemble was taken for an ecliptic one."""
+    map_ = xr.DataArray(np.arange(12.0), dims="pixel", attrs={"units": "mK", "frame": "galactic", "ordering": "RING"})
+    np.testing.assert_array_equal(in_order({"V": map_}, PARTS, "run.zarr")[0], 1000.0 * map_.values)
+    for attribute, value, named in [
+        ("frame", "ecliptic", ("run.zarr", "ecliptic", "galactic")),
+        ("frame", "of the focal plane", ("run.zarr", "frame", "G")),
+        ("ordering", "NESTED", ("run.zarr", "NESTED", "RING")),
+    ]:
+        with refused(*named):
+            in_order({"V": map_.assign_attrs({attribute: value})}, PARTS, "run.zarr")
