@@ -1,5 +1,6 @@
 """Noise of the pixels of a map: its standard deviation, and how it is drawn, from what a run says of the channel."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +22,10 @@ from mcsim.sphere.mask import read_mask
 from mcsim.support.arrays import Map, divided
 
 SMALLEST_UK2 = 1e-8
-"""Largest variance of a map of noise at least: 1 uK^2 is 1e-12 K^2, and the best surveys have 1e-4 uK^2 a pixel."""
+"""Largest variance of a map of variances, and mean square of a map of noise, at least.
+
+1 uK^2 is 1e-12 K^2, and the best surveys have 1e-4 uK^2 a pixel.
+"""
 
 
 class DrawnNoise(Protocol):
@@ -216,7 +220,7 @@ def _correlated(
 
 
 def _noise_map(path: Path, moments: Moments, frequency_ghz: float | None) -> Map:
-    """Return a noise map where the scan observes, 0 elsewhere."""
+    """Return a noise map where the scan observes, 0 elsewhere; InputError if it has no noise to speak of."""
     found = _temperature(path, moments, frequency_ghz)
     missing = int(np.sum(~np.isfinite(found) & (moments.hits > 0)))
     if missing:
@@ -224,7 +228,14 @@ def _noise_map(path: Path, moments: Moments, frequency_ghz: float | None) -> Map
             f"{path} has no noise in {missing} pixels that the scan observes; give them a value, or set "
             "them to 0 if a mask leaves them out."
         )
-    return np.where(moments.hits > 0, found, 0.0)
+    found = np.where(moments.hits > 0, found, 0.0)
+    square = float(np.mean(found**2))
+    if square < SMALLEST_UK2:
+        raise InputError(
+            f"{path} has noise of {math.sqrt(square):.3g} uK rms, less than any map's ({math.sqrt(SMALLEST_UK2):g} "
+            "uK); give a map that has noise, say its unit in its header (TUNIT), or give it in uK."
+        )
+    return found
 
 
 def _temperature(path: Path, moments: Moments, frequency_ghz: float | None) -> Map:

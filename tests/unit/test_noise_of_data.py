@@ -149,6 +149,17 @@ def test_realizations_are_those_of_the_files(files):
     assert level == pytest.approx(np.full(NPIX, np.std(1e6 * healpy.read_map(files.format(realization=0)))), rel=0.01)
 
 
+@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize(("factor", "unit"), [(0.0, "K"), (1.0, None)])
+def test_a_file_without_noise_or_in_another_unit_is_refused(files, number: int, factor: float, unit: str | None):
+    """The first file scales all: one of zeros silenced every realization. Noise in K that says no unit was none."""
+    path = files.format(realization=number)
+    in_kelvin = factor * healpy.read_map(path, dtype=float)
+    healpy.write_map(path, in_kelvin, column_units=unit, coord="G", overwrite=True, dtype=np.float64)
+    with refused(path, "TUNIT", 1e-4):
+        simulate.maps(survey(run_with({"kind": "realizations", "files": files})), number)
+
+
 def test_the_hash_is_over_the_first_file_and_the_name(files, tmp_path):
     def digest(name):
         return config.digest(run_with({"kind": "realizations", "files": str(tmp_path / name)}))
