@@ -50,6 +50,8 @@ IN_MAPS = ("beam", "elsewhere", "noise", "square", "cube", "rotation")
 
 ANY = f"1-{HARMONICS}"  #: of a wave in any way: a constant and all harmonics
 
+OFFSET = "square with a constant"  #: kind of a square whose zero is elsewhere than that of the maps
+
 LINE = "line "  #: begins the kind of what is along the line of sight of a channel, whose name follows
 
 LOWEST = "degrees 0-1"  #: kind of a monopole and a dipole
@@ -96,11 +98,11 @@ class Structure:
 
     def extends(self, other: "Structure") -> bool:
         """Return True for what has more than its mean, in time or on the sky, if that is the other one."""
-        longer = self.kind in ("elongation", "Galaxy") or self.kind.startswith(("degrees", "latitude", "step"))
+        longer = self.kind in ("elongation", "Galaxy", OFFSET) or self.kind.startswith(("degrees", "latitude", "step"))
         if not longer and not self.in_any_way:
             return False
-        stage = {"added": ("added", "power")}.get(self.stage, (self.stage,))
-        same = (self.acts_on, self.channel, self.split, self.index)
+        stage = {"added": ("added", "power"), "square": ("added",)}.get(self.stage, (self.stage,))
+        same = ("" if self.stage == "square" else self.acts_on, self.channel, self.split, self.index)
         mean = {"gain": "constant", "noise": "level"}.get(self.stage, "monopole")
         alike = (other.acts_on, other.channel, other.split, other.index) == same
         return other.stage in stage and other.kind == mean and alike
@@ -181,7 +183,7 @@ def _briefly(kind: str) -> list[str]:
         return [kind]
     if kind.startswith(HISTORIES):
         return [HISTORIES[0]]
-    return kind.split()[: 1 if kind.startswith(("degrees", "crossing", "source")) else 2]
+    return kind.split()[: 1 if kind.startswith(("degrees", "crossing", "source", "square")) else 2]
 
 
 def structures(scene: Scene) -> tuple[Structure, ...]:
@@ -310,8 +312,9 @@ def _of_the_sky(scene: Scene) -> Iterator[_Form]:
         for kind, zonal in _latitudes(scene.frame, top):
             yield "gain", acts_on, "sky", kind, [(key, j) for j in range((top + 1) ** 2)], zonal
     yield "gain", "dipole", "", "constant", [("dipole",)], None
-    yield "square", "sky and dipole", "", "square", [("square",)], None
-    yield "square", "sky", "", "square", [("square of the sky",)], None
+    for acts_on, key in (("sky and dipole", "square"), ("sky", "square of the sky")):
+        yield "square", acts_on, "", "square", [(key,)], None
+        yield "square", acts_on, "", OFFSET, [("added", 0), (key,)], None
     yield "cube", "sky and dipole", "", "cube", [("cube",)], None
     yield "rotation", "sky and dipole", "sky", "rotation", [("rotation", axis) for axis in range(3)], None
 

@@ -156,7 +156,9 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             return "BeamOrder", {"order": order, "edges": edges, "top": scene.lmax, "values": values}
         case "square" | "cube", _ if alike:
             acting = {"power": 2 if structure.stage == "square" else 3, "on_dipole": "dipole" in structure.acts_on}
-            return "SignalPower", {"factor": float(theta[0]), **acting}
+            *constant, factor = map(float, theta)
+            offset = {"offset": constant[0] / CONSTANT / factor} if constant else {}
+            return "SignalPower", {"factor": factor, **offset, **acting}
         case "rotation", _ if alike and not structure.moving:
             return "RotatedSky", {"rotation": tuple(map(float, theta))}
         case "noise", _ if structure.kind != "spectrum" and alike:

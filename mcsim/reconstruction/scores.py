@@ -19,8 +19,9 @@ from scipy.special import poch
 from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.reconstruction import sources
 from mcsim.reconstruction.choices import Choice
-from mcsim.reconstruction.forms import REFERENCE_GHZ, boosts, rotations
+from mcsim.reconstruction.forms import REFERENCE_GHZ
 from mcsim.reconstruction.periods import TimeLine
+from mcsim.reconstruction.sky_changes import boosts, rotations
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
 from mcsim.sphere.sky import dipole_alm

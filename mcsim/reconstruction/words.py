@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from mcsim.reconstruction.grammar import ALIKE, ANY, OPPOSITE, Structure
+from mcsim.reconstruction.grammar import ALIKE, ANY, OFFSET, OPPOSITE, Structure
 from mcsim.reconstruction.scores import Scene
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import Library
@@ -96,7 +96,7 @@ def _what(structure: Structure, theta: Vector) -> str:
         case "beam", _:
             return _order(structure.order, theta)
         case "square", _:
-            return f"follows the square of {structure.acts_on}"
+            return f"follows the square of {structure.acts_on}" + ", and a constant" * (kind == OFFSET)
         case "cube", _:
             return f"follows the cube of {structure.acts_on}"
         case "rotation", "Sun":

@@ -17,7 +17,7 @@ from mcsim.diagnosis import api
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import MapGrid
 from mcsim.instrument.scan.pointing import pointing
-from mcsim.reconstruction import forms, simulated_scores, words
+from mcsim.reconstruction import forms, simulated_scores, sky_changes, words
 from mcsim.reconstruction.figure import structure_figure
 from mcsim.reconstruction.grammar import ALIKE, structures
 from mcsim.reconstruction.plugin import Plugin, plugin
@@ -139,6 +139,7 @@ def added_by(structure, theta):
         ("beam", "scan", "order 0 as l^2", ALIKE),
         ("beam", "scan", "order 4", ALIKE),
         ("square", "", "square", ALIKE),
+        ("square", "", "square with a constant", ALIKE),
         ("cube", "", "cube", ALIKE),
         ("added", "time", "spin 1-4", ALIKE),
         ("added", "spacecraft", "line V1", ALIKE),
@@ -211,7 +212,7 @@ def test_real_harmonics_are_those_of_a_lm():
 def test_a_rotation_moves_the_map():
     alm, angle, n = random_alm(2, 6), 1e-5, np.stack(healpy.pix2vec(8, np.arange(768)))
     values = real.coefficients(alm, 6, 6)
-    for axis, change in enumerate(forms.rotations(alm, 6)):
+    for axis, change in enumerate(sky_changes.rotations(alm, 6)):
         back = n - angle * np.cross(np.eye(3)[axis], n.T).T
         moved = (real.field(values, *(back / np.linalg.norm(back, axis=0))) - real.field(values, *n)) / angle
         found = healpix.synthesis(change[None], 8, 6)[0]
@@ -377,7 +378,7 @@ def test_a_boost_is_that_of_the_library_for_small_velocities():
     sky = systematics.get("boost")(amplitude=beta, lon_deg=30.0, lat_deg=40.0)
     site = systematics.Site("W1", 94.0, "ecliptic", NSIDE, 6, Beam.gaussian(300.0, 6))
     change = (sky.sky(alm, site, None) - alm) / beta
-    linear = sum(v * one for v, one in zip(sky.vector / beta, forms.boosts(alm, 6), strict=True))
+    linear = sum(v * one for v, one in zip(sky.vector / beta, sky_changes.boosts(alm, 6), strict=True))
     np.testing.assert_allclose(linear, change, atol=1e-3)
 
 
@@ -386,7 +387,7 @@ def test_a_power_is_that_of_the_map():
     map_ = healpix.synthesis(alm[None], 32, 8)[0]
     for power in (2, 3):
         expected = healpix.analysis(map_**power, 8, 5)
-        np.testing.assert_allclose(forms.raised(alm, 8, power), expected, atol=1e-4 * np.abs(expected).max())
+        np.testing.assert_allclose(sky_changes.raised(alm, 8, power), expected, atol=1e-4 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize(

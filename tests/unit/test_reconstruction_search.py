@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mcsim.reconstruction.grammar import ALIKE, ANY, LOWEST, Structure
+from mcsim.reconstruction.grammar import ALIKE, ANY, LOWEST, OFFSET, Structure
 from mcsim.reconstruction.plugin import CONSTANT
 from mcsim.reconstruction.search import ALTERNATIVES, LEVEL, MOST, RARE, Response, Search, evidence
 
@@ -52,6 +52,24 @@ def test_a_pattern_is_told_from_its_mean(stage, mean, more):
     long, short = search.evidences(x)
     assert search.constants == {0: 1}
     assert short > long
+
+
+@pytest.mark.parametrize("acts_on", ["sky and dipole", "sky"])
+def test_a_square_is_told_from_its_constant(acts_on):
+    """A response that bends about another zero than that of the maps adds a monopole, too, and is a square."""
+    simulations = np.random.default_rng(1).normal(size=(400, 9))
+    bent = replace(plain("square", [0, 1]), kind=OFFSET, acts_on=acts_on)
+    square, mean = replace(plain("square", [1]), kind="square", acts_on=acts_on), plain("added", [0])
+    search = Search((bent, square, replace(mean, kind="monopole", frame="sky")), simulations)
+    assert search.constants == {0: 2}
+    assert bent.like(square)
+    x = np.zeros(9)
+    x[:2] = 8.0, 8.0
+    assert np.argmax(search.evidences(x)) == 0
+    x[0] = 0.0
+    assert np.argmax(search.evidences(x)) == 1
+    x[:2] = 8.0, 0.0
+    assert np.argmax(search.evidences(x)) == 2
 
 
 def test_what_is_beside_a_mean_is_not_charged_for_a_covariance_that_nobody_estimated():
