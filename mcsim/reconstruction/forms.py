@@ -213,8 +213,9 @@ class InTime(Form):
     """Derive forms that depend on time from this class."""
 
     #: "": constant; "spin", "year", "orientation": ``harmonic`` times spin phase, year or psi; "period": ``period_s``
-    #: from the start of the survey on; "trend": from -1 to 1 through the survey; "sky": a pattern fixed to it; of what
-    #: is added also those of :meth:`AddedToSamples.components`
+    #: from the start of the survey on; "trend": from -1 to 1 through the survey; "sky": a pattern fixed to it; "Sun":
+    #: the line of sight along the Earth's motion, and towards the Sun; of what is added also "lobe": the dipole along
+    #: the beam's x and y and the line of sight, uK
     wave: ClassVar[str] = ""
     harmonic: ClassVar[int] = 1
     period_s: ClassVar[float]
@@ -238,8 +239,11 @@ class InTime(Form):
             return np.full(len(time_s), self.coefficients[0])
         pointing = site.pointed(self.name)
         self.check_frame(site)
-        if self.wave == "sky":
+        if self.wave in ("sky", "Sun"):
             beam, _ = line_of_sight(pointing, time_s, site.frame)
+            if self.wave == "Sun":
+                towards = (heading(pointing.model, time_s, site.frame, phase) for phase in (0.0, 0.5 * np.pi))
+                return np.array(self.coefficients) @ np.stack([np.sum(one * beam, axis=0) for one in towards])
             return np.asarray(_maps_of(self.coefficients, (0,))[0][0][healpy.vec2pix(_NSIDE, *beam)])
         if self.wave == "trend":
             return self.coefficients[0] * (2.0 * time_s / (pointing.model.duration_days * SECONDS_PER_DAY) - 1.0)
@@ -268,28 +272,17 @@ class AddedToSamples(InTime, ByFrequency):
 
     spins: ClassVar[tuple[int, ...]] = (0,)
 
-    def components(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> list[Vector]:
-        """Return what the coefficients of a wave multiply that is a dipole, shape (n,) each.
-
-        "Sun": the line of sight along the Earth's motion, and towards the Sun; "lobe": the dipole along the beam's x
-        and y and the line of sight, uK.
-        """
-        outward, south, east = axes(theta, phi)
-        pointing = site.pointed(self.name)
-        if self.wave == "Sun":
-            towards = (heading(pointing.model, time_s, site.frame, phase) for phase in (0.0, 0.5 * np.pi))
-            return [np.sum(one * outward, axis=0) for one in towards]
-        c, s, (a, b) = np.cos(psi), np.sin(psi), (site.dipole_uk @ south, site.dipole_uk @ east)
-        return [c * a + s * b, c * b - s * a, site.dipole_uk @ outward]
-
     def signal(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> Vector:
         if self.wave == "sky":
             self.check_frame(site)
             pixel, value = healpy.ang2pix(_NSIDE, theta, phi), np.zeros(len(theta))
             for s, (q, u) in zip(self.spins, _maps_of(self.coefficients, self.spins), strict=True):
                 value += np.cos(s * psi) * q[pixel] + np.sin(s * psi) * u[pixel]
-        elif self.wave in ("Sun", "lobe"):
-            value = np.array(self.coefficients) @ np.array(self.components(time_s, theta, phi, psi, site))
+        elif self.wave == "lobe":
+            outward, south, east = axes(theta, phi)
+            cos, sin, (a, b) = np.cos(psi), np.sin(psi), (site.dipole_uk @ south, site.dipole_uk @ east)
+            seen = np.stack([cos * a + sin * b, cos * b - sin * a, site.dipole_uk @ outward])
+            value = np.array(self.coefficients) @ seen
         else:
             value = self.over_time(time_s, psi, site)
         return np.asarray(self.amplitude * self.seen(site) * self.factor(time_s, site) * value)

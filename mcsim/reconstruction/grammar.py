@@ -340,10 +340,9 @@ def _timed(scene: Scene, view: View, on: str) -> Iterator[_Form]:
         yield stage, on, "time", f"{wave} {ANY}", [constant, *every], None
     month = [key for k in range(MONTH[0], MONTH[1] + 1) for key in waves[f"year {k}"]]
     yield stage, on, "time", "month", month, None
-    if not on:
-        yield stage, "", "Sun", "dipole", waves["Sun"], None
-        cosines = [waves[f"spin {k}"][0] for k in range(1, ELONGATION + 1)]
-        yield stage, "", "Sun", "elongation", [constant, *cosines], None
+    yield stage, on, "Sun", "dipole", waves["Sun"], None
+    cosines = [waves[f"spin {k}"][0] for k in range(1, ELONGATION + 1)]
+    yield stage, on, "Sun", "elongation", [constant, *cosines], None
 
 
 def _added(scene: Scene) -> Iterator[_Form]:

@@ -132,7 +132,7 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             return "AddedToSamples", {"wave": "sky", "coefficients": pattern, **splits, **scaled}
         case "added", "spacecraft" | "time" | "Sun":
             return "AddedToSamples", timed
-        case "gain", "time" | "spacecraft" if structure.acts_on == "sky and dipole":
+        case "gain", "time" | "spacecraft" | "Sun" if structure.acts_on == "sky and dipole":
             return "GainOverTime", timed
         case "gain", "time" | "spacecraft":
             return "GainOfOne", {"on_sky": structure.acts_on == "sky", **timed}

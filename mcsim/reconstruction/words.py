@@ -84,6 +84,8 @@ def _what(structure: Structure, theta: Vector) -> str:
             return f"is added to the signal and follows the {_wave(kind)}"
         case "gain", "spacecraft":
             return f"is proportional to {on}, and follows the orientation of the beam (order {number})"
+        case "gain", "Sun":
+            return f"is proportional to {on}, and depends on {SUN[kind]}"
         case "gain", "time":
             return f"is proportional to {on}, and follows the {_wave(kind)}"
         case "gain", "sky":
@@ -181,7 +183,7 @@ SUN = {
     "dipole": "the angles of the line of sight to the directions of the Sun and of the Earth's motion, as a dipole",
     "elongation": "the distance from the Sun alone",
 }
-"""What a signal depends on in the frame of the Sun."""
+"""What a signal or a gain depends on in the frame of the Sun."""
 
 
 def _lobe(theta: Vector) -> str:

@@ -121,6 +121,8 @@ def added_by(structure, theta):
         ("gain", "time", "trend", ALIKE),
         ("gain", "time", "spin 1-4", ALIKE),
         ("gain", "spacecraft", "orientation 2", ALIKE),
+        ("gain", "Sun", "dipole", "half2"),
+        ("gain", "Sun", "elongation", ALIKE),
         ("elsewhere", "spacecraft", "line V1", ALIKE),
         ("elsewhere", "spacecraft", "opposite", ALIKE),
         ("elsewhere", "spacecraft", "lag", ALIKE),
