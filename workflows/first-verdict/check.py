@@ -2,7 +2,8 @@
 
 STORE is a model that mcsim diagnose has learned, $MCSIM_CACHE/diagnose/KEY.zarr. Its simulations, full skies that went
 through maps and filter, are divided at random: few to learn from, the others, or eight of them, to be tested. With
---drawn both are Gaussian draws from the covariance that all of them give: is the reference distribution right?
+--drawn both are Gaussian draws from the covariance that all of them give: is the reference distribution right? With
+--disjoint each set of as few as that is learned from once, and all others are tested: what do data of one model share?
 """
 
 import argparse
@@ -74,12 +75,30 @@ def drawn(ensemble, templates, groups, few, rounds):
     uniform(found)
 
 
+def disjoint(ensemble, templates, groups, few):
+    """Print p-values of all other simulations for every set of few."""
+    found, x = {"omnibus": [], "gap": []}, ensemble.simulations
+    for first in range(0, len(x) - few + 1, few):
+        own = slice(first, first + few)
+        judge = Judge(x[own], templates, groups, ensemble.redundant, pair_classes(ensemble.elements))
+        others = np.delete(x, own, axis=0)
+        null, each = judge.null, dict(zip(found, judge.pvalues(others), strict=True))
+        ratio = np.mean(np.sum(null.whiten(others) ** 2, axis=1)) * null.hartlap_factor / null.dimension
+        print(f"from {first}: worth {null.dof + 1}; chi^2 of the others is {ratio:.4f} of what the tests take")
+        uniform(each)
+        for name, values in each.items():
+            found[name] += values.tolist()
+    print("all sets together, whose others are the same:")
+    uniform(found)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("store", type=Path)
     parser.add_argument("--rounds", type=int, default=130)
     parser.add_argument("--each", type=float, default=3, help="simulations per element")
     parser.add_argument("--drawn", action="store_true", help="Gaussian draws in place of simulations")
+    parser.add_argument("--disjoint", action="store_true", help="every set of as few once, all others tested")
     given = parser.parse_args()
     ensemble, bank = load(given.store)
     x, floor = ensemble.simulations, ensemble.redundant
@@ -95,6 +114,9 @@ def main():
     few, classes = round(given.each * p), pair_classes(ensemble.elements)
     if given.drawn:
         drawn(ensemble, templates, groups, few, given.rounds)
+        return
+    if given.disjoint:
+        disjoint(ensemble, templates, groups, few)
         return
     print(f"{len(x)} simulations, {p} independent elements, {len(groups)} candidates; {few} to learn from")
     size = np.sqrt(whole.hartlap_factor) * np.linalg.norm(whole.whiten_templates(templates), axis=0)
