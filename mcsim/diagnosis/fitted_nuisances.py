@@ -19,10 +19,10 @@ from mcsim.datavector.analysis import simulated_maps
 from mcsim.datavector.campaign import constrained_jobs
 from mcsim.diagnosis.nuisance import NuisanceResult
 from mcsim.diagnosis.observed_maps import ObservedMaps
-from mcsim.reconstruction.grammar import Structure
 from mcsim.reconstruction.scores import Scene
 from mcsim.reconstruction.search import SMALL, Search
 from mcsim.reconstruction.simulated_scores import SEED, scores_of_maps
+from mcsim.reconstruction.structure import Structure
 from mcsim.simulation.channels import table_of
 from mcsim.simulation.nuisance import REACH, Nuisance, draws
 from mcsim.stats.gaussian import SimulatedGaussian

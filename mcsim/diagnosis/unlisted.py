@@ -20,12 +20,12 @@ from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.words import refuted
 from mcsim.reconstruction import words
-from mcsim.reconstruction.grammar import ALIKE, Structure
 from mcsim.reconstruction.plugin import Plugin, plugin
 from mcsim.reconstruction.result import NSIDE, WORDS, Reconstructed
 from mcsim.reconstruction.scores import Scene
 from mcsim.reconstruction.search import MOST, Response, Search
 from mcsim.reconstruction.simulated_scores import filtered, scene_for, scores_of_maps, search_of, with_peaks
+from mcsim.reconstruction.structure import ALIKE, Structure
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Map, Matrix, Vector

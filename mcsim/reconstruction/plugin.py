@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from mcsim.reconstruction.forms import FORMS, Form, Towards
-from mcsim.reconstruction.grammar import ALIKE, LOBE, OPPOSITE, Structure
+from mcsim.reconstruction.grammar import LOBE
 from mcsim.reconstruction.result import HEAD
 from mcsim.reconstruction.scores import ELSEWHERE, MONTH, Scene
+from mcsim.reconstruction.structure import ALIKE, OPPOSITE, Structure
 from mcsim.reconstruction.time_functions import HISTORIES
 from mcsim.support.arrays import Vector
 

@@ -17,7 +17,7 @@ class Reconstructed:
     """A structure that no effect of the library makes."""
 
     #: stage, acts_on, frame, kind, channel, split, index: what it is, in the words of the grammar
-    #: (:class:`mcsim.reconstruction.grammar.Structure`)
+    #: (:class:`mcsim.reconstruction.structure.Structure`)
     stage: str
     acts_on: str
     frame: str

@@ -14,8 +14,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.reconstruction.grammar import ALIKE, LOWEST, MEANS, Structure
+from mcsim.reconstruction.grammar import LOWEST
 from mcsim.reconstruction.scores import INDICES
+from mcsim.reconstruction.structure import ALIKE, MEANS, Structure
 from mcsim.sphere import healpix, real
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector, divided

@@ -23,7 +23,7 @@ from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.reconstruction import sources
 from mcsim.reconstruction.choices import Choice, angle_apart, frequency_apart
 from mcsim.reconstruction.forms import AddedToSamples
-from mcsim.reconstruction.grammar import Structure, structures
+from mcsim.reconstruction.grammar import structures
 from mcsim.reconstruction.periods import SHORTEST_S, SPANS, TimeLine
 from mcsim.reconstruction.scores import (
     ELONGATION,
@@ -39,6 +39,7 @@ from mcsim.reconstruction.scores import (
     coarse,
 )
 from mcsim.reconstruction.search import LEVEL, Search, evidence
+from mcsim.reconstruction.structure import Structure
 from mcsim.simulation import simulate
 from mcsim.simulation.pixel_means import Part, signal_of
 from mcsim.simulation.tod import Samples, every_ring, samples

@@ -4,8 +4,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from mcsim.reconstruction.grammar import ALIKE, ANY, OFFSET, OPPOSITE, Structure
 from mcsim.reconstruction.scores import Scene
+from mcsim.reconstruction.structure import ALIKE, ANY, OFFSET, OPPOSITE, Structure
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import Library
 from mcsim.systematics.base import scan_direction

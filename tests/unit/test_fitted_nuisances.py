@@ -8,7 +8,7 @@ import pytest
 from instruments import two_channels
 from mcsim import config, systematics
 from mcsim.diagnosis.fitted_nuisances import FittedNuisances, Marginal
-from mcsim.reconstruction.grammar import ALIKE, Structure
+from mcsim.reconstruction.structure import ALIKE, Structure
 from mcsim.simulation.nuisance import nuisances_of
 
 NUISANCES = [

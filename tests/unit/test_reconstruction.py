@@ -19,11 +19,12 @@ from mcsim.instrument.scan import MapGrid
 from mcsim.instrument.scan.pointing import pointing
 from mcsim.reconstruction import forms, simulated_scores, sky_changes, words
 from mcsim.reconstruction.figure import structure_figure
-from mcsim.reconstruction.grammar import ALIKE, structures
+from mcsim.reconstruction.grammar import structures
 from mcsim.reconstruction.plugin import Plugin, plugin
 from mcsim.reconstruction.result import Reconstructed
 from mcsim.reconstruction.scores import SUN
 from mcsim.reconstruction.search import Search
+from mcsim.reconstruction.structure import ALIKE
 from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_

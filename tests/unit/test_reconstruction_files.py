@@ -9,8 +9,8 @@ import healpy
 import numpy as np
 import pytest
 
-from mcsim.reconstruction.grammar import ALIKE, Structure
 from mcsim.reconstruction.plugin import Plugin, plugin
+from mcsim.reconstruction.structure import ALIKE, Structure
 from mcsim.systematics.sky import Boost
 
 

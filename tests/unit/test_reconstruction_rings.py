@@ -11,9 +11,10 @@ from mcsim import config
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import Model, model_of, wiener_filter
 from mcsim.reconstruction import simulated_scores
-from mcsim.reconstruction.grammar import ALIKE, OPPOSITE, structures
+from mcsim.reconstruction.grammar import structures
 from mcsim.reconstruction.plugin import plugin
 from mcsim.reconstruction.scores import Scene
+from mcsim.reconstruction.structure import ALIKE, OPPOSITE
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 

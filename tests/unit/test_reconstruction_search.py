@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mcsim.reconstruction.grammar import ALIKE, ANY, LOWEST, OFFSET, Structure
+from mcsim.reconstruction.grammar import LOWEST
 from mcsim.reconstruction.plugin import CONSTANT
 from mcsim.reconstruction.search import ALTERNATIVES, LEVEL, MOST, RARE, Response, Search, evidence
+from mcsim.reconstruction.structure import ALIKE, ANY, OFFSET, Structure
 
 
 def plain(stage, rows):

@@ -10,8 +10,9 @@ from mcsim import config
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import model_of, wiener_filter
 from mcsim.reconstruction import simulated_scores, words
-from mcsim.reconstruction.grammar import ALIKE, structures
+from mcsim.reconstruction.grammar import structures
 from mcsim.reconstruction.plugin import plugin
+from mcsim.reconstruction.structure import ALIKE
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 
