@@ -63,8 +63,8 @@ class Simulator:
         observe = tod.sky_signal(self.sky if sky is None else sky, self.site.lmax, beam or self.site.beam, 1e-8, 1)
 
         def pointed(half: int) -> Iterator[tod.Samples]:
-            share = (half / self.halves, (half + 1) / self.halves)
-            for chunk in tod.samples(model, pointing.line, MapGrid(nside, "ecliptic", share)):
+            grid = MapGrid(nside, "ecliptic", self.run.map.span(half))
+            for chunk in tod.samples(model, pointing.line, grid):
                 theta, phi = healpy.pix2ang(nside, chunk.pixel) if centred else (chunk.theta, chunk.phi)
                 extra = chunk.signal_uk if added is None else added(chunk)
                 turned = chunk.psi if psi is None else psi(chunk.psi)

@@ -16,7 +16,7 @@ EXTRA_ORDERS = 3  #: moments beyond the beam's orders: a displaced beam has them
 
 
 def quiet(run: config.RunConfig) -> config.RunConfig:
-    """Return the run without noise and effects, and with nothing to estimate; InputError without times of splits."""
+    """Return the run without noise and effects, and with nothing to estimate; InputError for splits by rings."""
     check_splits(run)
     run = named_source(run)[0]
     channels = tuple(channel.without_noise() for channel in run.channels)
@@ -45,11 +45,11 @@ def _has_samples(spec: config.Channel) -> bool:
 
 
 def check_splits(run: config.RunConfig) -> None:
-    """Raise InputError for splits whose samples have no time of their own."""
-    if run.map.split_by != "time":
+    """Raise InputError for splits by rings."""
+    if run.map.split_by == "rings":
         raise InputError(
-            f'{run.name} has map.split_by = "{run.map.split_by}", but the samples of maps that are compared are found '
-            'by their time; use splits by "time", or none.'
+            f'{run.name} has map.split_by = "rings", but the samples of a map that is compared follow each other in '
+            'time; use splits by "time", "sets", or none.'
         )
 
 

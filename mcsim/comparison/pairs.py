@@ -419,7 +419,7 @@ def _pair(
     sky = whole.config.sky
     named = sky.alm is not None or sky.map is not None
     truth = simulate.draw_sky(whole, 0) if named else np.zeros(alm_.size(sky.lmax), complex)
-    scene = scene_of(channel, truth, nthreads)
+    scene = scene_of(channel, whole.config.map, truth, nthreads)
     files = None
     spec = next(c for c in whole.config.channels if c.name == name)
     if isinstance(spec.scan, config.ScanPointing):

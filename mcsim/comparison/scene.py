@@ -11,6 +11,7 @@ import healpy
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim import config
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.instrument.scan.geometry import MapGrid
@@ -68,6 +69,7 @@ class Scene:
     #: what is done to the map of every split after it is made; empty: nothing
     preparations: tuple[Preparation, ...] = ()
     nthreads: int = 1  #: threads of the transforms
+    spans: tuple[tuple[float, float], ...] = ((0.0, 1.0),)  #: share of the survey's time that every split covers
     #: sign and offset in radians of the samples' orientation, beside that of the model
     psi: tuple[int, float] = (1, 0.0)
     centred: bool = False  #: True if samples stand at their pixels' centres
@@ -229,8 +231,7 @@ class Scene:
             yield from (chunk.pixel for chunk in tod.samples(model, pointing.line, grid, angles=False))
 
     def _grid(self, split: int) -> MapGrid:
-        count = len(self.moments)
-        return MapGrid(self.nside, self.moments[0].frame, (split / count, (split + 1) / count))
+        return MapGrid(self.nside, self.moments[0].frame, self.spans[split])
 
     def sampled(
         self, pointing: Pointing | PointingFiles, window: NDArray[np.float64], signal: tod.Stage | None = None
@@ -271,8 +272,9 @@ def keep(kept: OrderedDict[Any, Any], key: object, value: object, most: int) -> 
         kept.popitem(last=False)
 
 
-def scene_of(channel: Channel, sky: Alm, nthreads: int) -> Scene:
-    """Return the scene of a channel of a survey, as its maps are made and without its effects."""
+def scene_of(channel: Channel, grid: config.Map, sky: Alm, nthreads: int) -> Scene:
+    """Return the scene of a channel of a survey, as its maps are made and without its effects; ``grid``: of its run."""
     moments = tuple(m.moments for m in channel.maps)
+    spans = tuple(map(grid.span, range(len(moments))))
     preparations = tuple(m.preparation for m in channel.maps if m.preparation is not None)
-    return Scene(sky, channel.site.beam, channel.window, moments, preparations, nthreads)
+    return Scene(sky, channel.site.beam, channel.window, moments, preparations, nthreads, spans)

@@ -230,16 +230,13 @@ class ReversedMotion(Difference):
         model = scene.motion or pointing.model
         model = replace(model, **{self.motion: -getattr(model, self.motion)}).with_lines_of_sight(pointing.line.name)
         whole = scene if pair.scene is None else pair.scene
-        count, smax = len(scene.moments), min(scene.moments[0].smax, whole.beam.mmax + EXTRA_ORDERS)
+        smax = min(scene.moments[0].smax, whole.beam.mmax + EXTRA_ORDERS)
         key = model.spin_period_s, model.precession_period_s, smax
         if key not in self._made:
             self._made[key] = tuple(
-                Moments.from_model(
-                    model, scene.nside, smax, pair.channel.site.frame, (i / count, (i + 1) / count),
-                    scene.nthreads,
-                )
-                for i in range(count)
-            )  # fmt: skip
+                Moments.from_model(model, scene.nside, smax, pair.channel.site.frame, span, scene.nthreads)
+                for span in scene.spans
+            )
         moved = replace(scene, moments=self._made[key], motion=model, psi=(1, 0.0))
         oriented = (moved if scene.psi[0] > 0 else moved.reversed()).turned(scene.psi[1])
         return oriented.at_centres() if scene.centred else oriented

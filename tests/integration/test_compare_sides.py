@@ -25,6 +25,7 @@ from comparisons import (
     scaled,
     small,
 )
+from mcsim import config
 from mcsim.cli import app
 from mcsim.comparison import pairs, report
 from mcsim.comparison.prediction import Prediction, Set
@@ -362,3 +363,21 @@ def test_noise_hides_what_a_coarse_grid_makes_of_the_sky_too():
     alone = Set(members, problem.left(members))
     assert 0.1 < alone.left < 0.5
     assert problem.hidden(alone) == pytest.approx(alone.left, rel=0.3)
+
+
+@pytest.mark.parametrize("of", ["spin_sign", "psi_offset"])
+def test_each_set_is_the_whole_of_its_scan(of):
+    simulator = Simulator(MODEL | {"map": MODEL["map"] | {"split_by": "sets"}})
+    side_a = simulator()
+    np.testing.assert_array_equal(*side_a)
+    change, value = CASES[of]
+    found = mcsim.compare(side_a, change(simulator, side_a), simulator.run)
+    assert names(found) == [of]
+    assert found.channels[0].differences[0].amplitude == pytest.approx(value, rel=1e-3)
+    assert found.channels[0].left < 1e-5
+
+
+def test_splits_by_rings_are_refused():
+    run = config.load(MODEL | {"map": MODEL["map"] | {"split_by": "rings"}})
+    with refused("rings", '"time"', '"sets"'):
+        mcsim.compare([np.zeros(3072)] * 2, [np.zeros(3072)] * 2, run)
