@@ -67,7 +67,7 @@ class Form(Effect):
 
 @dataclass(frozen=True, kw_only=True)
 class ByFrequency(Form):
-    """What is added, times (frequency / 94 GHz)^``index``.
+    """What is added or departs, times (frequency / 94 GHz)^``index``.
 
     A ``foreground`` is not in the maps of a component separation.
     """
@@ -109,7 +109,7 @@ class CompactSource(ByFrequency):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GainPattern(Form):
+class GainPattern(ByFrequency):
     """The gain has a pattern fixed to the sky: it acts on sky, on dipole, or on both."""
 
     coefficients: ClassVar[tuple[float, ...]]
@@ -122,7 +122,8 @@ class GainPattern(Form):
         if self.on_dipole:
             seen = seen + dipole_alm(site.dipole_uk, site.lmax)
         values, degree = np.array(self.coefficients), int(np.sqrt(len(self.coefficients))) - 1
-        return sky + self.amplitude * multiplied(seen, site.lmax, lambda *n: real.field(values, *n), degree)
+        product = multiplied(seen, site.lmax, lambda *n: real.field(values, *n), degree)
+        return sky + self.amplitude * self.seen(site) * product
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,7 +187,7 @@ class SkyPower(Form):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BeamOrder(Form):
+class BeamOrder(ByFrequency):
     """The order m of the beam changes by value * B_l (l / lmax)^max(m, 1), in ranges of degrees from ``edges`` on.
 
     ``edges`` has one number more than ``values``: the last is ``top`` + 1.
@@ -202,7 +203,7 @@ class BeamOrder(Form):
         blm[: beam.mmax + 1] = beam.blm
         ell = np.arange(beam.lmax + 1.0)
         kernel = site.beam.blm[0].real * (ell / self.top) ** max(self.order, 1)
-        change = self.amplitude * steps(self.edges, self.values, beam.lmax) * kernel
+        change = self.amplitude * self.seen(site) * steps(self.edges, self.values, beam.lmax) * kernel
         change[: self.order] = 0.0
         blm[self.order] += change
         return replace(beam, blm=blm)
@@ -289,13 +290,14 @@ class AddedToSamples(InTime, ByFrequency):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GainOverTime(InTime):
+class GainOverTime(InTime, ByFrequency):
     """The gain of sky and dipole varies in time: a wave, or a constant or a pattern on the sky in some splits."""
 
     def gain(self, time_s: Vector, site: Site) -> Vector | None:
         if self.amplitude == 0.0:
             return None
-        return np.asarray(self.amplitude * self.factor(time_s, site) * self.over_time(time_s, None, site))
+        size = self.amplitude * self.seen(site)
+        return np.asarray(size * self.factor(time_s, site) * self.over_time(time_s, None, site))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,7 +311,7 @@ class GainOfOne(GainOverTime):
 
     def signal(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> Vector:
         dipole = site.dipole_uk @ axes(theta, phi)[0] * self.factor(time_s, site) * self.over_time(time_s, psi, site)
-        return np.asarray((-1.0 if self.on_sky else 1.0) * self.amplitude * dipole)
+        return np.asarray((-1.0 if self.on_sky else 1.0) * self.amplitude * self.seen(site) * dipole)
 
 
 @dataclass(frozen=True, kw_only=True)

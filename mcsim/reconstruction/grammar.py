@@ -18,6 +18,7 @@ from mcsim.reconstruction.scores import (
     ACTED_ON,
     ELONGATION,
     GAIN,
+    GROWTH,
     HARMONICS,
     HISTORY,
     MODULATION,
@@ -34,7 +35,7 @@ from mcsim.reconstruction.structure import ALIKE, ANY, LINE, MOTION, OFFSET, OPP
 from mcsim.reconstruction.time_functions import HISTORIES, LOBES, histories
 from mcsim.sphere import real
 from mcsim.sphere.rotation import FRAMES, rotation_matrix
-from mcsim.support.arrays import Matrix
+from mcsim.support.arrays import Matrix, Vector
 
 LOBE = 2  #: highest degree and spin of what a lobe sees
 
@@ -290,13 +291,32 @@ def _modulations(scene: Scene) -> Iterator[Structure]:
 
 
 def _scaled(scene: Scene) -> Iterator[Structure]:
-    """Yield what is added to all channels in proportion to a power of the frequency, but to separated components."""
-    for k, (index, scaling) in enumerate(scene.scalings.items()):
-        for split, factors in _splits(scene.splits):
-            weights = scaling * [factors[scene.views[i].split] for i in scene.shared]
-            views, weights = tuple(np.array(scene.shared)[weights != 0.0].tolist()), weights[weights != 0.0]
-            for stage, acts_on, frame, kind, keys, mix in _added(scene):
-                own = None, split, index, _rows(scene, keys, views), weights, mix, views, _tried(scene, kind)
-                yield Structure(stage, acts_on, frame, kind, *own)
-        keys = [("summed", k, b) for b in range(len(scene.fine) - 1)]
+    """Yield what all channels have in proportion to a power of the frequency, but separated components.
+
+    Light is added, whatever a beam makes of it; gains and beams depart as GROWTH.
+    """
+    if not scene.shared:
+        return
+    light = [*_added(scene), *_turned(scene, scene.views[scene.shared[0]])]
+    for k, index in enumerate(scene.scalings):
+        for split, views, weights in _in_proportion(scene, index):
+            yield from (_shared(scene, split, index, views, weights, form) for form in light)
+        keys: list[Key] = [("summed", k, b) for b in range(len(scene.fine) - 1)]
         yield replace(_plain(scene, "added", "sky", "power", None, keys), index=index)
+    for split, views, weights in _in_proportion(scene, GROWTH):
+        for form in _forms(scene, split, list(views)):
+            if form[:2] in (("gain", "sky and dipole"), ("beam", "sky")):
+                yield _shared(scene, split, GROWTH, views, weights, form)
+
+
+def _in_proportion(scene: Scene, index: float) -> Iterator[tuple[str, tuple[int, ...], Vector]]:
+    """Yield splits, the maps that have a signal there, and how strong it is in each."""
+    for split, factors in _splits(scene.splits):
+        weights = scene.scaling(index) * [factors[scene.views[i].split] for i in scene.shared]
+        yield split, tuple(np.array(scene.shared)[weights != 0.0].tolist()), weights[weights != 0.0]
+
+
+def _shared(scene: Scene, split: str, index: float, views: tuple[int, ...], weights: Vector, form: _Form) -> Structure:
+    stage, acts_on, frame, kind, keys, mix = form
+    own = None, split, index, _rows(scene, keys, views), weights, mix, views, _tried(scene, kind)
+    return Structure(stage, acts_on, frame, kind, *own)

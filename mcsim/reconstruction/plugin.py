@@ -104,7 +104,9 @@ def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plug
         or values.get("wave") in ("sky", "orientation")  # psi is counted from the meridian of the maps
     )
     frame = {"frame": scene.frame} if framed else {}
-    return Plugin(name, base, structure.channel or scene.channels[0], {**scope, **frame, **values})
+    index = structure.index
+    shared = {} if index is None else {"index": index, "foreground": structure.stage == "added"}
+    return Plugin(name, base, structure.channel or scene.channels[0], {**scope, **frame, **values, **shared})
 
 
 def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[str, Any]] | None:
@@ -119,18 +121,17 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
         timed = {"coefficients": (1.0,), "splits": pattern}
     elif structure.frame in ("spacecraft", "time", "Sun"):
         timed |= _wave(structure)
-    scaled = {"index": structure.index or 0.0, "foreground": structure.index is not None}
     match structure.stage, structure.frame:
         case "added", "sky" if structure.kind.startswith("orientation"):
             return "AddedToSamples", {"wave": "sky", "spins": (int(structure.kind.split()[1]),), **timed}
         case "added", "sky" if structure.kind.startswith("source"):
             lon_deg, lat_deg = map(float, structure.kind.split()[1:])
-            place = {"lon_deg": lon_deg, "lat_deg": lat_deg, **scaled}
+            place = {"lon_deg": lon_deg, "lat_deg": lat_deg}
             return ("CompactSource", {"factor": float(theta[0]), **place}) if alike else None
         case "added", "sky" if structure.kind != "power":
             if alike:
-                return "AddedPattern", {"coefficients": pattern, **scaled}
-            return "AddedToSamples", {"wave": "sky", "coefficients": pattern, **splits, **scaled}
+                return "AddedPattern", {"coefficients": pattern}
+            return "AddedToSamples", {"wave": "sky", "coefficients": pattern, **splits}
         case "added", "spacecraft" | "time" | "Sun":
             return "AddedToSamples", timed
         case "gain", "time" | "spacecraft" | "Sun" if structure.acts_on == "sky and dipole":

@@ -43,6 +43,9 @@ ACTED_ON = ("sky and dipole", "sky", "dipole")  #: what a wave multiplies, if it
 PERIODIC = ("", ACTED_ON[0])  #: what a wave multiplies whose period is not known, or what steps or decays
 INDICES = (-3.0, -2.0, 1.5)
 """Power of the frequency, in thermodynamic units, of signals of several channels: synchrotron, free-free, dust."""
+GROWTH = 2.0
+"""Power of the frequency of changes of gains or beams of several channels: phase errors of a surface (Ruze, Proc. IEEE
+54, 633, 1966) and the continuum of water vapour grow so."""
 HISTORY = 16  #: equal parts of the survey's time, in which steps and decays are known
 ELSEWHERE = 32  #: highest degree of a signal from elsewhere: a lobe has as many orders, and what is finer averages out
 
@@ -133,9 +136,13 @@ class Scene:
 
         Beside a map of separated components, what all others have alike is no part of the sky itself: the power 0.
         """
-        known = [self.frequencies[self.views[i].channel] or REFERENCE_GHZ for i in self.shared]
         indices = INDICES if all(self.foregrounds) else (0.0, *INDICES)
-        return {index: (np.array(known) / REFERENCE_GHZ) ** index for index in (indices if known else ())}
+        return {index: self.scaling(index) for index in (indices if self.shared else ())}
+
+    def scaling(self, index: float) -> Vector:
+        """Return a power of the frequency over 94 GHz in each of the maps that share signals by their frequencies."""
+        known = [self.frequencies[self.views[i].channel] or REFERENCE_GHZ for i in self.shared]
+        return (np.array(known) / REFERENCE_GHZ) ** index
 
     def edges(self, first: int) -> tuple[int, ...]:
         """Return where ranges of degrees from ``first`` on start, and lmax + 1."""

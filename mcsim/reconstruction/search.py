@@ -195,7 +195,7 @@ class Search:
     @cached_property
     def finer(self) -> dict[int, int]:
         """Return the power at higher degrees that a foreground has besides, of its pattern to the highest degree."""
-        light = [k for k, one in enumerate(self.grammar) if one.split == ALIKE and self.nulls[k] is not None]
+        light = [k for k, one in enumerate(self.grammar) if one.is_light and self.nulls[k] is not None]
         powers = {self.grammar[k].index: k for k in light if self.grammar[k].of_a_foreground}
         tops = {self.grammar[k].index: k for k in light if self.grammar[k].kind.startswith("degrees 0-")}
         return {k: powers[index] for index, k in tops.items() if index in powers}

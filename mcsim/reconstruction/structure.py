@@ -126,6 +126,11 @@ class Structure:
         return self.kind == "power" and self.index is not None
 
     @property
+    def is_light(self) -> bool:
+        """Return True for light that is fixed to the sky, and the same in all splits."""
+        return (self.stage, self.frame, self.split) == ("added", "sky", ALIKE)
+
+    @property
     def leaves_low(self) -> bool:
         """Return True if the scores leave out monopoles and dipoles that the structure makes."""
         return self.stage == "modulation" or (self.stage, self.acts_on) == ("gain", "sky")

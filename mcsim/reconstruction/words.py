@@ -32,7 +32,7 @@ _LIKE: tuple[tuple[str, str, str, str], ...] = (
 
 def cause(structure: Structure, library: Library) -> str:
     """Return a known cause of such structures with its reference, or nothing."""
-    name = "foreground_residual" if structure.index is not None else ""
+    name = "foreground_residual" if structure.index is not None and structure.stage == "added" else ""
     for stage, frame, kind, effect in _LIKE if not name else ():
         if structure.stage == stage and structure.frame == frame and structure.kind.startswith(kind):
             name = effect
