@@ -17,6 +17,7 @@ from mcsim.datavector.summaries import Element
 from mcsim.diagnosis.consistency import Action, Comparison, Findings, MapCheck, Slices, contradiction
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix
+from mcsim.systematics.added import LATE
 
 NSIDE = 16
 GAIN = Candidate(systematics.get("gain_drift"), "W1", (0, 1))
@@ -276,3 +277,22 @@ def test_a_ring_has_one_sign(quadrupole, error, possible):
         assert fitted.quadrupole == 1.0
     elif possible:
         assert distance == 0.0
+
+
+@pytest.mark.parametrize(
+    ("along", "across", "possible"),
+    [(0.0, 0.0027, False), (0.05, 0.0, True), (-0.003, 0.0018, True), (0.003, -9e-4, True)],
+)
+def test_an_orbital_dipole_is_late_by_an_hour_at_most(along, across, possible):
+    """Towards the Sun it is nearly a monopole: a monopole of S/N 7 was a set with one that is four hours late."""
+    dipole = Candidate(systematics.get("orbital_dipole"), "W1", (0, 1))
+    coordinates, covariance = np.array([along, across]), np.diag([4e-4, 4e-4]) ** 2
+    distance = dipole.beyond(coordinates, covariance)
+    assert np.isfinite(distance) == possible
+    fitted = dipole.fitted(coordinates, covariance)
+    found = dipole.parametrization.coordinates(fitted)
+    assert abs(found[1]) <= LATE * (1.0 + 1e-9)
+    assert fitted.within_bounds() is fitted
+    if abs(across) <= LATE:
+        assert distance == 0.0
+        np.testing.assert_allclose(found, coordinates, rtol=1e-12)
