@@ -1,12 +1,15 @@
 """Realizations and workers that fail every time, disks that fill, kills at awkward moments: nothing is lost."""
 
 import errno
+import json
+import logging
 import os
 import re
 import shutil
 import socket
 import subprocess
 import sys
+import time
 from contextlib import nullcontext
 from functools import partial
 from importlib.metadata import version
@@ -195,6 +198,31 @@ def test_a_scheduler_that_is_lost_between_tasks_is_a_sentence(error: Exception) 
 
     with refused("scheduler", by=RunError):
         list(runner.completed(Lost(), pow, [(2, 3)]))
+
+
+def test_a_scheduler_that_is_killed_leaves_no_traceback(tmp_path: Path) -> None:
+    """The client printed 32 lines of its attempt to connect again, before the sentence of the command."""
+    printed: list[logging.LogRecord] = []
+    listener = logging.Handler()
+    listener.emit = printed.append  # type: ignore[method-assign]
+    logging.getLogger("distributed.client").addHandler(listener)
+    file = tmp_path / "scheduler.json"
+    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", file]
+    command = [sys.executable, "-m", "dask", "scheduler", *options]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as scheduler:
+        try:
+            while not (file.exists() and file.stat().st_size):
+                assert scheduler.poll() is None
+                time.sleep(0.05)
+            with cluster.connected(json.loads(file.read_text())["address"]) as client:
+                scheduler.kill()
+                while client.status == "running":
+                    time.sleep(0.02)
+                time.sleep(0.5)  # in which it tries to connect again
+        finally:
+            scheduler.kill()
+            logging.getLogger("distributed.client").removeHandler(listener)
+    assert printed == []
 
 
 def test_summary_whose_workers_die_is_a_sentence(

@@ -221,11 +221,30 @@ class _Remote(Client):
 
 
 @contextmanager
+def _without_tracebacks() -> Iterator[None]:
+    """Keep distributed's client from printing tracebacks of a scheduler that is lost; the error of a call says it."""
+    logger = logging.getLogger("distributed.client")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+@contextmanager
 def remote_client(scheduler: str) -> Iterator[Client]:
     """Yield the client of a running scheduler, whose workers have the driver's packages."""
+    with _without_tracebacks(), _remote(scheduler) as client:
+        _check_workers(client)
+        yield client
+
+
+def _remote(scheduler: str) -> Client:
+    """Connect to a running scheduler; raise InputError if none answers."""
     try:
         # No default client: one that fails would leave Dask without a scheduler for the rest of the session.
-        client = _Remote(scheduler, timeout=ANSWER_S, set_as_default=False)
+        return _Remote(scheduler, timeout=ANSWER_S, set_as_default=False)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         certificates = "certificates that Dask's configuration names in distributed.comm.tls"
         if scheduler.startswith("tls://") and isinstance(error, TypeError):  # from a call without an ssl_context
@@ -237,9 +256,6 @@ def remote_client(scheduler: str) -> Iterator[Client]:
             late = f"within {ANSWER_S:g} s ({why})"
             refusal = f"No Dask scheduler answers at {scheduler} {late}; start one or correct the address"
         raise InputError(f"{refusal}.") from error
-    with client:
-        _check_workers(client)
-        yield client
 
 
 def threads_of(scheduler: str) -> int:
