@@ -23,6 +23,9 @@ from mcsim.support.folders import user_path
 NEGLIGIBLE = 0.1
 """Leading order suffices if the higher orders are below this size in sigma: no parameter shifts by more."""
 
+AS_GOOD = 9.0  #: a second minimum is told of if its chi^2 is higher by less than this
+SAME = 1e-4  #: imaginary parts of minima that are one; a turn of 0.003 degrees
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -41,6 +44,9 @@ class Fit:
     design: NDArray[np.float64]
     solution: Solution  #: parameters, their covariance, chi2, its degrees of freedom and probability
     beyond_leading: float | None = None
+    #: of ``orientation`` the second minimum, whose imaginary part has the other sign, if its chi^2 is higher by less
+    #: than :data:`AS_GOOD`: spectra that have only the square of that part do not tell its sign
+    other: Solution | None = None
     each: tuple[Solution, ...] = ()  #: fits of every realization, if made by :func:`fit_each`
 
     @property
@@ -83,6 +89,8 @@ class Fit:
             "correlation": solution.correlation.tolist(),
             **{key: getattr(solution, key) for key in ("chi2", "dof", "reduced_chi2", "probability", "simulations")},
         }
+        if self.other is not None:
+            result["other"] = {"parameters": named(self.other.parameters), "chi2": self.other.chi2}
         if self.each:
             estimates = np.array([one.parameters for one in self.each])
             pulls = self.pulls(solution.parameters)
@@ -145,10 +153,15 @@ def _fit(made: Templates, name: str, knots: int, order: Order) -> Fit:
     if order == "leading" or (order == "auto" and beyond is not None and beyond < NEGLIGIBLE):
         return Fit(measured, chosen, "leading", offset, design, solution, beyond)
     expected = made.exact(chosen)
-    best = _minimise(measured, expected, solution.parameters)
+    best, *others = _minima(measured, expected, solution.parameters, mirrored="imaginary" in chosen.parameters)
     design = expected.derivative(best)
     offset = expected.at(best) - design @ best
-    return Fit(measured, chosen, "exact", offset, design, _solve(measured, offset, design), beyond)
+    solution, other = _solve(measured, offset, design), None
+    for place in others:
+        slope = expected.derivative(place)
+        found = _solve(measured, expected.at(place) - slope @ place, slope)
+        other = found if found.chi2 - solution.chi2 < AS_GOOD else None
+    return Fit(measured, chosen, "exact", offset, design, solution, beyond, other)
 
 
 def fit_models(
@@ -181,8 +194,27 @@ def _solve(measured: Measurement, offset: NDArray[np.float64], design: NDArray[n
     return solve(measured.value - offset, design, measured.covariance, measured.simulations)
 
 
-def _minimise(measured: Measurement, expected: Polynomial, start: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the parameters that minimise chi^2."""
+def _minima(
+    measured: Measurement, expected: Polynomial, start: NDArray[np.float64], mirrored: bool
+) -> list[NDArray[np.float64]]:
+    """Return the parameters at which chi^2 has a minimum, the lowest first.
+
+    ``mirrored``: of a complex factor there may be two, of either sign of the imaginary part. The search begins where
+    that part is at most 1, as the mean of turned beams has it, whatever the leading order makes of it, and not at 0,
+    where the search would stay.
+    """
+    if not mirrored:
+        return [_minimise(measured, expected, start)[0]]
+    aside = np.array([start[0], np.clip(abs(start[1]), 0.1, 1.0)])
+    found = [_minimise(measured, expected, aside * [1.0, sign]) for sign in (1.0, -1.0)]
+    (best, _), (other, _) = sorted(found, key=lambda one: one[1])
+    return [best] if abs(best[1] - other[1]) < SAME else [best, other]
+
+
+def _minimise(
+    measured: Measurement, expected: Polynomial, start: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Return the parameters at a minimum of chi^2, and half of the value there."""
     white = whitening(measured.value, expected.linear, measured.covariance, measured.simulations)
 
     def residual(theta: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -197,7 +229,7 @@ def _minimise(measured: Measurement, expected: Polynomial, start: NDArray[np.flo
         raise InputError(
             f"the fit of {measured.origin} to all orders does not converge ({found.message}); choose a simpler model."
         )
-    return np.asarray(found.x)
+    return np.asarray(found.x), float(found.cost)
 
 
 def fit_each(found: Fit) -> Fit:

@@ -7,7 +7,7 @@ import numpy as np
 
 from mcsim.beamfit.effective_beam import Fit, comparisons
 from mcsim.errors import InputError
-from mcsim.support.numbers import measured
+from mcsim.support.numbers import measured, number
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,11 @@ def _model(one: Fit) -> list[str]:
             f"way by half; or {measured(angles.one_sided_deg, angles.one_sided_error_deg, ' deg')}, one as configured"
         )
         if angles.common_deg is not None and angles.common_error_deg is not None:
-            lines.append(f"    both turned by {measured(angles.common_deg, angles.common_error_deg, ' deg')}")
+            turned = measured(angles.common_deg, angles.common_error_deg, " deg")
+            if one.other is not None:
+                angle = np.degrees(-0.5 * np.arctan2(one.other.parameters[1], one.other.parameters[0]))
+                turned += f", or by {number(angle)} deg, where chi2 is {one.other.chi2 - solution.chi2:.1f} higher"
+            lines.append(f"    both turned by {turned}")
     if one.each:
         each = one.to_dict()["realizations"]
         pulls = ", ".join(f"{name} {width:.3f}" for name, width in each["pull_width"].items())

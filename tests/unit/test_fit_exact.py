@@ -1,6 +1,7 @@
 """Fits to all orders in the beam: against independent predictions, a brute-force minimum, and ensembles of skies."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -135,6 +136,23 @@ def test_the_minimum_is_that_of_a_brute_force_search_over_predictions(shared):
     # The error of the tangent is that of the chi^2: one error away it is higher by one.
     side = 0.5 * sum(chi2(searched.x + sign * found.errors[0]) for sign in (-1.0, 1.0)) - searched.fun
     assert side == pytest.approx(1.0, rel=0.01)
+
+
+@pytest.mark.parametrize("imaginary", [0.4, -0.4])
+def test_a_sign_that_spectra_do_not_tell_is_said(shared, imaginary):
+    """Even parity has the square of the imaginary part: of 0.7 - 0.4 i the fit was 0.7 + 0.4 i, with a small error."""
+    data = measured(predicted(shared, 0.7 + imaginary * 1j + 0.0 * ELL), 0.005)
+    weak = np.where([row.mode.parity == "odd" for row in ROWS], 1e4, 1.0)
+    found = fit(replace(data, covariance=data.covariance * np.outer(weak, weak)), shared, "orientation")
+    both = [found.solution.parameters[1], found.other.parameters[1]]
+    assert both[0] * both[1] < 0.0
+    assert min(abs(one - imaginary) for one in both) < 1e-3
+    assert found.solution.chi2 <= found.other.chi2 < found.solution.chi2 + 9.0
+    assert "or by" in report([found])
+    assert found.to_dict()["other"]["parameters"]["imaginary"] == both[1]
+    told = fit(data, shared, "orientation")
+    np.testing.assert_allclose(told.solution.parameters, [0.7, imaginary], rtol=1e-7)
+    assert told.other is None
 
 
 def test_leading_order_is_enough_where_the_data_cannot_tell(shared):
