@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError, RunError
 from mcsim.support import folders
 from mcsim.support.arrays import numbers
+from mcsim.support.npy import write_npy
 
 
 class Rule(NamedTuple):
@@ -99,7 +100,7 @@ def table_of(given: Tabled) -> dict[str, str]:
 
 def _file_of(array: NDArray, key: str) -> str:
     """Write an array to the cache; return the path of its .npy file, named after the key."""
-    folder = kept(lambda scratch: np.save(scratch / f"{key}.npy", array), key)
+    folder = kept(lambda scratch: write_npy(scratch / f"{key}.npy", array), key)
     return _path(folder / f"{key}.npy", key)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from mcsim.datavector.analysis import Job
 from mcsim.support import folders
 from mcsim.support.arrays import Matrix, Vector
+from mcsim.support.npy import write_npy
 
 NSIDE = 128  #: up to this resolution a piece has as many realizations as a task, beyond it fewer, as each takes longer
 LEAST = 2  #: realizations of a piece at any resolution: a worker prepares the survey of each effect anew
@@ -59,10 +60,9 @@ class Kept:
         folder = self._stream(piece)
         with folders.unwritable(folder, "make room there, or set MCSIM_CACHE to another folder"):
             folder.mkdir(parents=True, exist_ok=True)
-            handle, scratch = tempfile.mkstemp(dir=folder)
-            with os.fdopen(handle, "wb") as stream:
-                np.save(stream, rows)
-            os.replace(scratch, folder / f"{piece.first}-{piece.first + piece.count}.npy")
+            with tempfile.TemporaryDirectory(dir=folder) as scratch:
+                write_npy(whole := Path(scratch) / f"{piece.first}-{piece.first + piece.count}.npy", rows)
+                os.replace(whole, folder / whole.name)
 
     def _stream(self, job: Job) -> Path:
         """Return the folder of all realizations of one kind."""

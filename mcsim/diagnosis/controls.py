@@ -31,7 +31,7 @@ from mcsim.simulation.survey import Survey
 from mcsim.simulation.survey import survey as survey_
 from mcsim.support import folders
 from mcsim.support.code import package_digest
-from mcsim.support.npy import read_npy
+from mcsim.support.npy import read_npy, write_npy
 from mcsim.support.numbers import duration
 from mcsim.support.progress import reporting
 
@@ -144,7 +144,7 @@ def draw(run: str, library: Kinds, sample_by_sample: bool, realization: int, fol
     with folders.appearing(Path(folder)) as scratch:
         shared = _survey(run, library).at(realization)
         every = sampled.maps(shared, realization) if sample_by_sample else enumerate(simulate.maps(shared, realization))
-        np.save(scratch / "maps.npy", np.stack([map_uk for _, map_uk in every]))
+        write_npy(scratch / "maps.npy", np.stack([map_uk for _, map_uk in every]))
 
 
 @lru_cache(maxsize=1)

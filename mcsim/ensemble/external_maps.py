@@ -297,12 +297,11 @@ def stacked(given: Any, parts: tuple[Part, ...]) -> str:
         raise InputError("the given maps are no maps of one resolution; give arrays over pixels, in RING order.")
 
     def write(folder: Path) -> None:
-        whole = np.lib.format.open_memmap(
-            folder / "maps.npy", mode="w+", dtype=np.float64, shape=(number, len(parts), *shape)
-        )
-        for r in range(number):
-            whole[r] = np.stack(rows(r))
-        whole.flush()
+        layout = {"descr": "<f8", "fortran_order": False, "shape": (number, len(parts), *shape)}
+        with (folder / "maps.npy").open("wb") as stream:
+            np.lib.format.write_array_header_1_0(stream, layout)
+            for r in range(number):
+                stream.write(np.stack(rows(r)).astype("<f8").tobytes())
 
     return str(arrays.kept(write, "maps") / "maps.npy")
 

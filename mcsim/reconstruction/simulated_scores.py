@@ -48,6 +48,7 @@ from mcsim.sphere import healpix
 from mcsim.support import folders
 from mcsim.support.arrays import Map, Matrix, Vector, divided
 from mcsim.support.code import class_digest, package_digest
+from mcsim.support.npy import write_npy
 from mcsim.systematics import Pointing
 from mcsim.systematics.spacecraft import axes, heading, spin_phase
 
@@ -379,6 +380,6 @@ def null_scores(analysis: Analysis, ask: Ask, chosen: tuple[str, ...] = ()) -> M
         job = replace(analysis.job(seeded(run, SEED)), nuisances=bool(run.nuisances), chosen=chosen)
         starts = range(0, SIMULATIONS, PER_TASK)
         jobs = [replace(job, first=k, count=min(PER_TASK, SIMULATIONS - k)) for k in starts]
-        np.save(folder / "scores.npy", np.concatenate(ask(jobs)))
+        write_npy(folder / "scores.npy", np.concatenate(ask(jobs)))
 
     return np.asarray(np.load(folders.cached(f"diagnose/unlisted-{key}", fill) / "scores.npy"))

@@ -20,6 +20,7 @@ from mcsim.support import folders
 from mcsim.support.arrays import Map, divided
 from mcsim.support.code import class_digest, package_digest
 from mcsim.support.compiled import njit
+from mcsim.support.npy import write_npy
 from mcsim.systematics import Effect, Site, adding, basis_of, spread_of
 
 _TIMES = 4096  #: at which a gain or a signal is evaluated for the key
@@ -215,7 +216,7 @@ def _kept(what: str, where: tuple[Effect, Site, Part], values: Map, mean: Callab
     own = hashlib.sha256(text + values.tobytes()).hexdigest()
 
     def fill(folder: Path) -> None:
-        np.save(folder / f"{what}.npy", mean((effect,), site, part))
+        write_npy(folder / f"{what}.npy", mean((effect,), site, part))
 
     # Mapped, so that all processes share it.
     return np.asarray(np.load(folders.cached(f"{what}-{scan[:32]}-{own[:32]}", fill) / f"{what}.npy", mmap_mode="r"))

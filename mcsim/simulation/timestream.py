@@ -26,6 +26,7 @@ from mcsim.sphere import rng
 from mcsim.support import folders
 from mcsim.support.arrays import Map, divided
 from mcsim.support.code import package_digest
+from mcsim.support.npy import write_npy
 
 SECONDS_PER_SAMPLE = 1.2e-7
 """Time of one core for a sample of correlated noise: pointing, random numbers, filter, sums."""
@@ -172,11 +173,11 @@ def _fill(folder: Path, empty: CorrelatedNoise) -> None:
         begin = np.concatenate([[0], np.cumsum(filled)]).astype(np.int32)  # at most LARGEST
         made = replace(made, pairs=csr_matrix((count, pixel, begin), shape=(total, hits.size)))
         for name in ("data", "indices", "indptr"):
-            np.save(folder / f"{name}.npy", getattr(made.pairs, name))
+            write_npy(folder / f"{name}.npy", getattr(made.pairs, name))
     drawn = [made._drawn(0, r, f"level of {empty.streams}") for r in range(LEVEL_DRAWS)]
     level = math.sqrt(np.mean([per_hit(each, hits) ** 2 for each in drawn]))
-    np.save(folder / "hits.npy", hits)
-    np.save(folder / "level.npy", np.sqrt(divided(np.full(hits.size, level**2), hits)))
+    write_npy(folder / "hits.npy", hits)
+    write_npy(folder / "level.npy", np.sqrt(divided(np.full(hits.size, level**2), hits)))
 
 
 def _check(noise: NoiseCorrelated, model: ScanModel) -> None:

@@ -28,7 +28,7 @@ from mcsim.sphere.header import first_table, frame_named, opened, to_uk
 from mcsim.support.arrays import Alm, Map
 from mcsim.support.code import package_digest
 from mcsim.support.folders import cached, unreadable
-from mcsim.support.npy import read_npy
+from mcsim.support.npy import read_npy, write_npy
 
 
 @lru_cache(maxsize=4)
@@ -200,7 +200,7 @@ def _distances(face: int, nside: int, split: int) -> NDArray[np.float64]:
     code = package_digest([__name__], ["healpy", "numpy"])
 
     def fill(scratch: Path) -> None:
-        np.save(scratch / "distances.npy", _histogram(face, nside, split))
+        write_npy(scratch / "distances.npy", _histogram(face, nside, split))
 
     try:
         folder = cached(f"pixels-{face}-{nside}-{split}-{code[:32]}", fill)

@@ -1,12 +1,34 @@
-"""Readers of numpy's .npy and .npz files."""
+"""Numpy's .npy and .npz files: readers, and a writer that says why it fails."""
 
+import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.support.folders import unreadable
+
+
+def write_npy(path: Path, array: NDArray) -> None:
+    """Write an array as :func:`numpy.save` does, bit for bit; OSError with its number where that fails.
+
+    Of a full disk numpy.save says no more than "20700 requested and 17392 written", without the number of the error.
+    """
+    with path.open("wb") as stream:
+        np.save(SimpleNamespace(write=stream.write), array, allow_pickle=False)
+
+
+def make_room(path: Path, size: int) -> None:
+    """Make a file of so many bytes, of zeros; OSError where the disk has no room.
+
+    Who writes into a file that is mapped to memory, and has no room, is ended by a signal (SIGBUS).
+    """
+    with path.open("wb") as stream:
+        stream.truncate(size)
+        if size and hasattr(os, "posix_fallocate"):  # macOS lacks it
+            os.posix_fallocate(stream.fileno(), 0, size)
 
 
 def read_npy(path: str | Path, kind: str = "biufc", ndims: tuple[int, ...] = (1,)) -> NDArray:

@@ -10,13 +10,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from shutil import which
 
+import numpy as np
 import pytest
 from distributed import Client
 
+from mcsim import config
+from mcsim.datavector.analysis import analysis_of
+from mcsim.datavector.kept import Kept
 from mcsim.ensemble import repair, runner, store
 from mcsim.errors import RunError
+from mcsim.instrument.scan import Moments
 from mcsim.simulation import simulate
-from mcsim.support.folders import filling
+from mcsim.support.folders import cached, filling
+from mcsim.support.npy import make_room
 from refusals import refused
 
 from .conftest import table
@@ -113,3 +119,31 @@ def test_disk_that_becomes_read_only(
     # What another thread of the first run had begun may end once the disk is writable; it is not computed again either.
     assert 0 < result.computed <= 10 - finished
     assert_same(path, small_store)
+
+
+def test_an_array_on_a_full_disk_is_named(disk: Path) -> None:
+    """numpy said "20700 requested and 17392 written": the caller's input was blamed, or it was a traceback."""
+    assert remount(disk, "size=64k")
+    moments = Moments.parallel_transport(nside=32)
+    with refused(disk / "moments", by=RunError, errno=errno.ENOSPC):
+        moments.save(disk / "moments")
+    with refused(disk, by=RunError), pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MCSIM_CACHE", str(disk))
+        cached("other", moments.save)
+
+
+def test_a_simulation_that_a_full_disk_cannot_keep_leaves_nothing(disk: Path) -> None:
+    assert remount(disk, "size=64k")
+    run = config.load(table())
+    job = analysis_of(run).job(run)
+    kept = Kept(disk / "parts", 10)
+    with refused(disk, by=RunError, errno=errno.ENOSPC):
+        kept.keep(job, np.zeros((10, 4000)))
+    assert not [path for path in disk.rglob("*") if path.is_file()]
+
+
+def test_a_file_that_is_mapped_has_room(disk: Path) -> None:
+    """Without room the process was ended by a signal when it wrote."""
+    assert remount(disk, "size=64k")
+    with refused(by=OSError, errno=errno.ENOSPC):
+        make_room(disk / "samples.raw", 1_000_000)

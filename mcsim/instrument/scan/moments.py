@@ -22,6 +22,7 @@ from mcsim.sphere.checks import check_finite, check_nside, check_number, check_s
 from mcsim.support import folders
 from mcsim.support.arrays import divided, reals
 from mcsim.support.code import package_digest
+from mcsim.support.npy import write_npy
 
 _META = "moments.json"
 _ARRAYS = ("hits", "w", "dtheta", "dphi", "offset_moments")
@@ -375,11 +376,10 @@ class Moments:
 
     def save(self, folder: str | Path) -> None:
         """Write the arrays as .npy files into ``folder``, which is created."""
-        remedy = "make room there, or choose another folder (MCSIM_CACHE for the cache)"
-        with folders.unwritable(folder := folders.user_path(folder), remedy):
+        with folders.unwritable(folder := folders.user_path(folder), "choose another, in MCSIM_CACHE for the cache"):
             folder.mkdir(parents=True, exist_ok=True)
             for name, array in self._arrays().items():
-                np.save(folder / f"{name}.npy", array)
+                write_npy(folder / f"{name}.npy", array)
             meta = {"nside": self.nside, "frame": self.frame, "offsets": self.offset_order}
             (folder / _META).write_text(json.dumps(meta))
 

@@ -19,6 +19,7 @@ from mcsim.simulation.tod import chunks
 from mcsim.support import folders
 from mcsim.support.code import package_digest
 from mcsim.support.compiled import njit
+from mcsim.support.npy import make_room, write_npy
 from mcsim.support.threads import interruptible
 
 PARTS = 16  #: parts of the survey that threads share out; fixed, so that sums do not depend on the number of threads
@@ -143,7 +144,8 @@ def _write(
     """Write the pairs of two streams of pointing, whose chunks threads share out."""
     first, last = shares[0][0][0], shares[-1][-1][1]
     path = folder / "samples.raw"
-    pixels = np.memmap(path, dtype=np.int32, mode="w+", shape=(2, last - first))
+    make_room(path, 2 * (last - first) * np.dtype(np.int32).itemsize)
+    pixels = np.memmap(path, dtype=np.int32, mode="r+", shape=(2, last - first))
 
     def run(stream: PointingStream, share: list[tuple[int, int]], own: NDArray[np.int32]) -> None:
         for low, high in share:
@@ -162,7 +164,7 @@ def _write(
         hits = [_counted(side, grid.npix) for side in pixels]
         row_start, count_type = _write_rows(folder, pixels, hits[0] + hits[1], nthreads, pool, progress)
     for name, array in (("row_start", row_start), ("hits_a", hits[0]), ("hits_b", hits[1])):
-        np.save(folder / f"{name}.npy", array)
+        write_npy(folder / f"{name}.npy", array)
     path.unlink()
     (folder / _META).write_text(json.dumps({"pairs": int(row_start[-1]), "count": count_type.name}))
 
@@ -186,8 +188,8 @@ def _write_rows(
             group = bands[done : done + nthreads]
             for (low, high), merged in zip(group, pool.map(partial(_band, pixels, entries), group), strict=True):
                 partner, count, lengths = merged
-                partner.tofile(partner_file)
-                count.astype(count_type).tofile(count_file)
+                partner_file.write(partner.tobytes())
+                count_file.write(count.astype(count_type).tobytes())
                 row_start[low + 1 : high + 1] = lengths
             progress(0.5 + 0.5 * (done + len(group)) / len(bands))
     return np.cumsum(row_start), np.dtype(count_type)
