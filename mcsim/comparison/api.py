@@ -124,10 +124,10 @@ def compare(
             progress(number + 1.0)
     result = ComparisonResult(case, tuple(found), sides.not_compared)
     if output is not None:
-        Path(output).mkdir(parents=True, exist_ok=True)
         text = json.dumps(result.to_dict(), indent=1, allow_nan=False) + "\n"
-        (Path(output) / "compare.json").write_text(text, encoding="utf-8")
-        (Path(output) / "report.html").write_text(report.page(result), encoding="utf-8")
+        with folders.filling(target := Path(output)):
+            folders.write_whole(target / "compare.json", text)
+            folders.write_whole(target / "report.html", report.page(result))
     return result
 
 

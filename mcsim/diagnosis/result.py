@@ -23,6 +23,7 @@ from mcsim.reconstruction.result import HEAD, Reconstructed
 from mcsim.stats.excess import HeldOut, Measured, excess_of
 from mcsim.stats.look_elsewhere import GlobalTest
 from mcsim.support.arrays import Vector, texts
+from mcsim.support.folders import write_whole
 
 STORE = "diagnosis.zarr"
 PLACES = 12  #: groups in the localisation table of ``verdict.json`` and of the report
@@ -351,9 +352,9 @@ class DiagnosisResult:
             if path.stem not in used | set(written) and HEAD in path.read_text(encoding="utf-8", errors="replace"):
                 path.unlink()
         for name, text in written.items():
-            (target / f"{name}.py").write_text(text, encoding="utf-8")
+            write_whole(target / f"{name}.py", text)
         write_dataset(self.to_dataset(), target / STORE)
-        (target / "verdict.json").write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n")
+        write_whole(target / "verdict.json", json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n")
 
     @classmethod
     def open(cls, folder: str | Path) -> "DiagnosisResult":

@@ -25,7 +25,7 @@ from zarr.storage import MemoryStore
 
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.errors import InputError, RunError
-from mcsim.support.folders import is_full, outside_stores, unwritable
+from mcsim.support.folders import appearing, is_full, outside_stores, real_path, unwritable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -330,14 +330,19 @@ def _absent_value(dtype: np.dtype) -> dict[str, Any]:
 
 
 def write_dataset(dataset: "xr.Dataset", folder: Path, **form: Any) -> None:
-    """Write a dataset that is in memory to a folder, in place of what is there, as :meth:`xarray.Dataset.to_zarr`."""
+    """Write a dataset that is in memory to a folder, in place of what is there, as :meth:`xarray.Dataset.to_zarr`.
+
+    What is there stays if the new one cannot be written.
+    """
     files: Files = {}
     with warnings.catch_warnings():
         # Zarr warns that consolidated metadata, which xarray looks for, are not yet standard.
         warnings.simplefilter("ignore", category=UserWarning)
         dataset.to_zarr(MemoryStore(files), **({"consolidated": True} | form))
-    shutil.rmtree(folder, ignore_errors=True)
-    _write_files(files, folder)
+    with appearing(folder) as scratch:
+        _write_files(files, scratch)
+        if (place := real_path(folder)).is_dir():
+            shutil.rmtree(place)
 
 
 def _write_files(files: Files, folder: Path) -> None:

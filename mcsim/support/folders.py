@@ -144,7 +144,7 @@ def _written_beside(path: Path, text: str) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch = path.with_name(f".{path.name}.{uuid4().hex}")
     try:
-        scratch.write_text(text)
+        scratch.write_text(text, encoding="utf-8")
         yield scratch
     finally:
         scratch.unlink(missing_ok=True)

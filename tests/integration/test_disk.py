@@ -12,16 +12,19 @@ from shutil import which
 
 import numpy as np
 import pytest
+import xarray as xr
 from distributed import Client
 
 from mcsim import config
 from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.kept import Kept
+from mcsim.diagnosis import report
 from mcsim.ensemble import repair, runner, store
+from mcsim.ensemble.store import write_dataset
 from mcsim.errors import RunError
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import simulate
-from mcsim.support.folders import cached, filling
+from mcsim.support.folders import cached, filling, write_whole
 from mcsim.support.npy import make_room
 from refusals import refused
 
@@ -56,6 +59,22 @@ def test_a_full_disk_of_a_report_is_named(disk: Path) -> None:
     assert remount(disk, "size=4096")
     with refused(disk / "out", by=RunError, errno=errno.ENOSPC), filling(disk / "out"):
         (disk / "out" / "report.html").write_bytes(bytes(100_000))
+
+
+def test_what_is_there_stays_whole_where_the_next_does_not_fit(disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A report was cut off, and a dataset was deleted and begun anew."""
+    small, large = (xr.Dataset({"a": ("x", np.random.default_rng(1).normal(size=n))}) for n in (10, 20_000))
+    write_dataset(small, disk / "x.zarr")
+    write_whole(disk / "report.html", "first")
+    assert remount(disk, "size=64k")
+    monkeypatch.setattr(report, "page", lambda result: 100_000 * "a")
+    with refused(disk, by=RunError, errno=errno.ENOSPC), filling(disk):
+        write_dataset(large, disk / "x.zarr")
+    with refused(disk, by=RunError, errno=errno.ENOSPC), filling(disk):
+        report.write(None, disk / "report.html")
+    xr.testing.assert_identical(xr.open_zarr(disk / "x.zarr", chunks=None), small)
+    assert (disk / "report.html").read_text() == "first"
+    assert sorted(path.name for path in disk.iterdir()) == ["report.html", "x.zarr"]
 
 
 def test_full_disk(small_store: Path, client: Client, disk: Path) -> None:
