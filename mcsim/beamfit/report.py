@@ -70,8 +70,9 @@ def report(fits: Sequence[Fit]) -> str:
     data = fits[0].measured
     modes = ", ".join(mode.name for mode in data.modes)
     first = min(row.ell_min for row in data.rows)
+    of = "" if data.pair is None else f" of {data.pair}"
     lines = [
-        f"{data.origin}: {data.kind} spectra {modes}, ell = {first}-{data.lmax}, {len(data.rows)} bins",
+        f"{data.origin}: {data.kind} spectra {modes}{of}, ell = {first}-{data.lmax}, {len(data.rows)} bins",
         f"  {_order(fits)}",
         f"  {_tests(data.simulations)}",
     ]

@@ -112,7 +112,7 @@ def fit(
     model: Annotated[list[str] | None, Option(help="constant, linear, spline or orientation; repeatable.")] = None,
     ell_min: Annotated[int | None, Option(min=0, help="First ell of the data.")] = None,
     ell_max: Annotated[int | None, Option(min=2, help="Last ell of the data.")] = None,
-    pair: Annotated[str | None, Option(help="Pair of maps; default: the only one.")] = None,
+    pair: Annotated[str | None, Option(help='Pair of maps, for example "W1,W1"; default: the first.')] = None,
     mode: Annotated[list[str] | None, Option(help="Such as L2M0d0; repeatable; default: A20 at d = 0 and 2.")] = None,
     kind: Annotated[str | None, Option(help="plain, or difference to the controls, the default where known.")] = None,
     order: Annotated[str, Option(help="leading, exact, or auto: exact where the data tell them apart.")] = "auto",

@@ -88,6 +88,9 @@ def test_a_constant_does_not_fit_a_slope_and_the_comparison_says_so(shared):
     assert tests["constant", "linear"].probability < 1e-6
     assert tests["linear", "spline"].probability > 0.99
     text = report(fits)
+    assert "L2M0d2, ell" in text
+    named = [replace(one, measured=replace(one.measured, pair="V1,W1")) for one in fits]
+    assert "L2M0d2 of V1,W1, ell" in report(named)
     assert "linear over constant" in text
     assert "correlation" in text
 
