@@ -17,7 +17,7 @@ from mcsim.datavector.bipolar_scan import rms
 from mcsim.datavector.candidate import Candidate, TemplateBank
 from mcsim.datavector.kept import Kept
 from mcsim.datavector.null_ensemble import NullEnsemble, without_nuisances
-from mcsim.datavector.repeats import check_distinct
+from mcsim.datavector.repeats import check_distinct, check_fresh
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import pair_classes
 from mcsim.ensemble import runner
@@ -26,6 +26,7 @@ from mcsim.errors import InputError
 from mcsim.simulation.nuisance import draws
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.shrinkage import shrunk
+from mcsim.support.arrays import Vector
 from mcsim.support.progress import reporting
 from mcsim.systematics import Effect
 
@@ -175,6 +176,11 @@ def check_count(analysis: Analysis, simulations: int | None) -> None:
             f"{stored} realizations of {source.label} are too few for a data vector of {size} elements; give more than "
             f"{size}, {settings.sims_per_element} for each independent one, or leave effects out (--without)."
         )
+
+
+def check_data(x: Vector, ensemble: NullEnsemble, source: Source) -> None:
+    """Raise InputError if data, shape (p,), are a realization of an external simulator that they are tested with."""
+    check_fresh(x, ensemble.simulations, source, _COVARIANCE)
 
 
 def is_of_the_model(job: Job) -> bool:

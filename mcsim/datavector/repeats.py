@@ -5,7 +5,7 @@ from scipy.spatial import KDTree
 
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
-from mcsim.support.arrays import Matrix, divided
+from mcsim.support.arrays import Matrix, Vector, divided
 
 REPEATS = 1e-6
 """Rms difference over the rms up to which two maps or data vectors are the same: threads add numbers in any order."""
@@ -28,3 +28,17 @@ def check_distinct(rows: Matrix, source: Source, seed: int) -> None:
         f"{source.words(seed, first)} and {source.words(seed, again)} are the same; {len(rows)} realizations are asked "
         f"for, and {distinct} of them {'differs' if distinct == 1 else 'differ'}: {remedy}."
     )
+
+
+def check_fresh(x: Vector, rows: Matrix, source: Source, seed: int) -> None:
+    """Raise InputError for data, shape (p,), that are one of the realizations, (N, p), that they are tested with.
+
+    They are near the mean of a sample that they are in: of 150 simulations of 82 elements all have p-values above 0.9.
+    """
+    spread = np.sqrt(np.mean(rows**2, axis=0))
+    apart = np.sqrt(np.mean(divided(rows - x, spread) ** 2, axis=1))
+    if apart.min() <= REPEATS:
+        raise InputError(
+            f"the data are {source.words(seed, int(apart.argmin()))}, one of those that they are tested with, and the "
+            "p-value would be too large; give other data, or leave it out of the realizations."
+        )

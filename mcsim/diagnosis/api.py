@@ -126,6 +126,8 @@ def diagnose(
             found: DataSet[Any] = (
                 ObservedMaps(known, maps, ask) if table is None else MeasuredSpectra(known, table, ask)
             )
+            if source is not None:
+                campaign.check_data(found.x, ensemble, source)
             diagnosis = diagnose_data(found, case or run.name)
         if diagnosis.kind == "unknown" and isinstance(found, ObservedMaps) and source is None:
             with asking(call, quiet, simulated_scores.scores, "simulations of what is not listed") as ask:
