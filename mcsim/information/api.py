@@ -251,8 +251,10 @@ def _candidates(
                 f"{name} adds noise at random to samples, of which the limit knows nothing; ask for noise_level, whose "
                 "response is nearly the same."
             )
-    orders = max(DiagnosisSettings().beam_orders, settings.orders)
-    fits = DiagnosisSettings(beam_orders=orders, including=tuple(name for name in named if name in library))
+    # The survey has the orientation moments of as many orders as a diagnosis measures.
+    usual = DiagnosisSettings(including=tuple(name for name in named if name in library))
+    more = max(0, settings.orders - usual.beam_orders)
+    fits = replace(usual, beam_orders=usual.beam_orders + more, beam_bins=(*usual.beam_bins, *(1,) * more))
     analysis = analysis_of(run, settings.without, nthreads, fits, library)
     known = {c.name for c in analysis.candidates}
     known |= {f"{c.name}:{c.channel}" for c in analysis.candidates if c.channel is not None}

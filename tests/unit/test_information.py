@@ -130,6 +130,18 @@ def test_signals_of_samples_change_the_mean(name: str) -> None:
     assert found.sigma < 8.0 / best
 
 
+def test_orders_above_those_that_a_diagnosis_measures_are_taken() -> None:
+    """They were refused for bins of a diagnosis, which nobody had given. Each order adds less than the one before."""
+    strong = config.BeamEllipticalGaussian(fwhm_major_arcmin=1200.0, fwhm_minor_arcmin=600.0, m_max=6)
+    run = replace(model(), channels=(replace(model().channels[0], beam=strong),))
+    sigma = []
+    for orders in (0, 2, 4, 6):
+        settings = mcsim.LimitSettings(only=("calibration",), dense=True, orders=orders)
+        sigma.append(mcsim.limit(run, settings=settings).effects[0].sigma)
+    changes = np.abs(np.diff(sigma)) / sigma[-1]
+    assert 0.0 < changes[2] < 0.1 * changes[1] < 0.1 * 0.1 * changes[0]
+
+
 def test_noise_that_hits_samples_at_random_has_no_limit() -> None:
     with refused("excess_noise", "noise_level"):
         mcsim.limit(model(), settings=mcsim.LimitSettings(only=("excess_noise",)))
