@@ -204,6 +204,8 @@ def broken_parts(path: Path) -> dict[str, str]:
                         raise ValueError("its file is missing")
         except _FAULTS as error:
             broken[name] = _reason(error)
+    if (path / "summary").is_dir() and "summary" not in remembered:
+        broken["summary"] = "the metadata of the store, by which it is found, do not have it"
     return broken
 
 
@@ -318,6 +320,7 @@ def write_summary(path: Path, summary: "xr.Dataset") -> None:
         encoding = {name: _CODECS | _absent_value(array.dtype) for name, array in summary.variables.items()}
         write_dataset(summary, Path(scratch) / "summary", encoding=encoding, **form)
         shutil.rmtree(path / "summary", ignore_errors=True)
+        _consolidate(path)  # what ends before the next time has no summary, instead of one that is described wrongly
         os.replace(Path(scratch) / "summary", path / "summary")
         _consolidate(path)
 
@@ -354,9 +357,9 @@ def _write_files(files: Files, folder: Path) -> None:
 
 def summarised(path: Path) -> tuple[int, list[int]]:
     """Return the number of realizations in the summary, 0 without one, and the first ell of each of its bins."""
-    if not (path / "summary").is_dir():
-        return 0, []
     with faults_named(path):
+        if not (path / "summary").is_dir() or "summary" not in _remembered(path):
+            return 0, []
         count, first = (np.asarray(_member(_open(path / "summary"), name)[...]) for name in ("count", "bin_first"))
         return int(count), first.tolist()
 

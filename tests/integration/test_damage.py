@@ -1,6 +1,7 @@
 """Damage to a store: files that are missing, cut or changed are named, and computed again, and no more."""
 
 import asyncio
+import errno
 import json
 import os
 import shutil
@@ -91,6 +92,36 @@ def test_metadata_coordinates_and_summary_are_made_again(
     assert result.computed == 0
     assert_same(copy, small_store)
     assert repair.verify(copy).intact
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_summary_that_the_store_does_not_describe_is_made_again(
+    resume: bool, small_store: Path, client: Client, copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last that a run writes is the metadata of all: a disk may be full by then, or the run killed."""
+    consolidated, done = store._consolidate, []
+
+    def ended(path: Path) -> None:
+        if done:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        done.append(path)
+        consolidated(path)
+
+    shutil.rmtree(copy / "summary")
+    monkeypatch.setattr(store, "_consolidate", ended)
+    with refused("copy.zarr", "--resume", by=RunError, errno=errno.ENOSPC):
+        runner.run(table(), copy, workers=client)
+    monkeypatch.undo()
+    verdict = repair.verify(copy)
+    assert verdict.broken.keys() == {"summary"}
+    assert "repairs this" in verdict.text()
+    with refused("copy.zarr", "--resume", by=RunError):
+        opening.open_summary(copy)
+    result = runner.run(table(), copy, resume=resume, workers=client)
+    assert (result.computed, result.summarised) == (0, True)
+    assert_same(copy, small_store)
+    with opening.open_summary(copy) as found, opening.open_summary(small_store) as expected:
+        xr.testing.assert_identical(found.load(), expected.load())
 
 
 @pytest.mark.parametrize("part", ["biposh/c/1", "cl", "ell/c/0", "summary/cl_mean"])
