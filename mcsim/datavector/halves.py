@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from mcsim.datavector.null_ensemble import NullEnsemble
-from mcsim.stats.excess import HeldOut, excess, expected_fall, expected_fall_of_draw, held_out
+from mcsim.stats.excess import HeldOut, excess, expected_fall, expected_fall_of_draw, held_out, scatter_chi2
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 
@@ -53,12 +53,19 @@ class Halves:
         return size - expected > max(sigma, BENT * expected)
 
     def reduction(
-        self, t: Matrix, respond: Callable[[Fit], Vector], scatters: Sequence[Matrix] = (), data: str = ""
+        self,
+        t: Matrix,
+        respond: Callable[[Fit], Vector],
+        scatters: Sequence[Matrix] = (),
+        data: str = "",
+        skies: Callable[[Fit], tuple[Matrix, Matrix] | None] | None = None,
     ) -> HeldOut:
         """Fit templates, shape (p, K), to one part, freeze the amplitudes, and measure the reduction in the other.
 
         ``respond`` returns the response of the data vector to the frozen fit, shape (p,); ``scatters`` are deviations
-        of stochastic responses from their mean, shape (p, draws) each; ``data`` names the part that judges.
+        of stochastic responses from their mean, shape (p, draws) each; ``data`` names the part that judges. ``skies``
+        returns data vectors of the same skies without the frozen effects and with them, shape (skies, p), where these
+        scatter the data more: noise of which there is more adds to chi^2 of data that it describes rightly.
         """
         t_used, t_fresh = t[self.first], t[self.second]
         x_used, x_fresh = self.x[self.first], self.x[self.second]
@@ -78,7 +85,15 @@ class Halves:
             fall = expected_fall_of_draw(after, t_fresh, noise, excess(self.used, x_used), shares)
         else:
             fall = expected_fall(self.fresh, t_fresh, frozen.amplitudes, frozen.covariance)
-        return held_out(self.fresh, after, x_fresh, fall, data)
+        pair = None if skies is None else skies(frozen)
+        return held_out(self.fresh, after, x_fresh, fall, data, (0.0, 0.0) if pair is None else self._scatter(*pair))
+
+    def _scatter(self, before: Matrix, after: Matrix) -> tuple[float, float]:
+        """Return the traces of the covariance that effects add to the part that judges, and of its square."""
+        one, other = before[:, self.second], after[:, self.second]
+        size = float(np.sum(self.fresh.whiten_templates(np.mean(other - one, axis=0)[:, None]) ** 2))
+        added, square = scatter_chi2(self.fresh, np.zeros((len(self.second), 0)), one, other)
+        return added * size, square * size**2
 
 
 def _squares(null: SimulatedGaussian, draws: Matrix) -> Vector:

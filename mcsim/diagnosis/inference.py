@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
+from mcsim import config
 from mcsim.datavector.candidate import columns_of, parts_of, scatters_of, tables_at, tables_beside
 from mcsim.datavector.halves import Halves
 from mcsim.diagnosis.assemble import result_of
@@ -146,18 +147,26 @@ def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:
         )
     )
 
-    def respond(frozen: Fit) -> Vector:
+    def acting_at(frozen: Fit) -> list[config.Effect]:
         if free.shape[1] < len(free):
             # Where the coordinates of an effect move together, those of all data say which of them are near.
             covariance = free @ frozen.covariance @ free.T + best.covariance
             frozen = replace(frozen, amplitudes=free @ frozen.amplitudes, covariance=covariance)
-        acting = tables_at(context.candidates, members, frozen)
+        return tables_at(context.candidates, members, frozen)
+
+    def respond(frozen: Fit) -> Vector:
+        acting = acting_at(frozen)
         change: Vector = matrix @ data.respond(acting, context.settings.constrained_skies).mean(axis=0)
         if not scatters and halves.exceeds(change, t @ frozen.amplitudes, context.settings.reduction_sigma):
             raise InputError("the response is far from straight between the amplitudes of all data and of a half.")
         return change
 
+    def skies(frozen: Fit) -> tuple[Matrix, Matrix] | None:
+        noisier = any(context.candidates[member].parametrization.noise_alone for member in members)
+        pair = data.pair(acting_at(frozen)) if noisier and not scatters else None
+        return None if pair is None else (pair[0] @ matrix.T, pair[1] @ matrix.T)
+
     try:
-        return halves.reduction(t @ free, respond, scatters, words)
+        return halves.reduction(t @ free, respond, scatters, words, skies)
     except InputError:
         return None

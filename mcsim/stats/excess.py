@@ -162,10 +162,19 @@ def expected_fall_of_draw(
     return Measured(share * seen.value - lost, sigma)
 
 
-def held_out(before: SimulatedGaussian, after: SimulatedGaussian, x: Vector, expected: Measured, data: str) -> HeldOut:
+def held_out(
+    before: SimulatedGaussian,
+    after: SimulatedGaussian,
+    x: Vector,
+    expected: Measured,
+    data: str,
+    widened: tuple[float, float] = (0.0, 0.0),
+) -> HeldOut:
     """Return the reduction of the excess chi^2 of data, shape (p_raw,), from one null distribution to another.
 
-    ``expected`` is the fall of chi^2 that the fit to other data predicts.
+    ``expected`` is the fall of chi^2 that the fit to other data predicts. ``widened`` are the traces of a covariance,
+    and of its square, that effects add to that of ``after`` in white coordinates: the p-value of what remains tolerates
+    it, as :func:`mcsim.stats.gaussian.residual_pvalue` does.
 
     Notes
     -----
@@ -190,4 +199,6 @@ def held_out(before: SimulatedGaussian, after: SimulatedGaussian, x: Vector, exp
     scaled = (after.scale_variance - before.scale_variance) * p * (p + 2)
     scatter, last = scatter + scaled, replace(last, sigma=float(np.hypot(last.sigma, np.sqrt(scaled))))
     sigma = float(np.sqrt(noise + scatter)) / abs(first.value)
-    return HeldOut(forecast, Measured(fraction, sigma), first, last, after.pvalue(x), data)
+    added, square = widened
+    remains = float(after.residual_test(after.chi2(x), allowance=added, spread=square))
+    return HeldOut(forecast, Measured(fraction, sigma), first, last, remains, data)

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from mcsim.datavector.halves import Halves
 from mcsim.stats.elliptical import f_tail, leave_one_out, scale_variance
 from mcsim.stats.excess import scatter_chi2
-from mcsim.stats.gaussian import SimulatedGaussian, held_out_pvalues, residual_pvalue
+from mcsim.stats.gaussian import Fit, SimulatedGaussian, held_out_pvalues, residual_pvalue
 
 SEED = 20121024
 
@@ -114,3 +115,27 @@ def test_a_response_without_scatter_adds_nothing() -> None:
     null, t = SimulatedGaussian(np.zeros(9), np.eye(9), 1000), np.eye(9)[:, :1]
     before = rng.normal(size=(8, 9))
     assert scatter_chi2(null, t, before, before + 5.0 * t[:, 0]) == pytest.approx((0.0, 0.0), abs=1e-12)
+
+
+def test_what_remains_of_rightly_described_noise_is_uniform():
+    """Data of a fifth more noise, frozen at what the other half says: two thirds had p below 0.05."""
+    rng = np.random.default_rng(SEED)
+    p, a, skies, draws = 80, 0.2, 24, 300
+    t = np.zeros((p, 1))
+    t[::4] = 12.0  # variances, which say how large the noise is; all other elements only scatter more
+    simulations = rng.normal(size=(800, p))
+    first, second = np.arange(p // 2), np.arange(p // 2, p)
+    used, fresh = (SimulatedGaussian.from_simulations(simulations[:, rows]) for rows in (first, second))
+    pvalues: dict[bool, list[float]] = {False: [], True: []}
+    for _ in range(draws):
+        halves = Halves((t * a)[:, 0] + (1.0 + a) * rng.normal(size=p), used, fresh, first, second)
+        z = rng.normal(size=(skies, p))
+
+        def pair(frozen: Fit, z: np.ndarray = z) -> tuple[np.ndarray, np.ndarray]:
+            return z, t @ frozen.amplitudes + (1.0 + frozen.amplitudes[0]) * z
+
+        for told in (False, True):
+            found = halves.reduction(t, lambda frozen: t @ frozen.amplitudes, skies=pair if told else None)
+            pvalues[told].append(found.pvalue_after)
+    assert np.mean(np.array(pvalues[False]) < 0.05) > 0.4
+    assert stats.kstest(pvalues[True], "uniform").pvalue > 0.01
