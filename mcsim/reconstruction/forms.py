@@ -69,7 +69,7 @@ class Form(Effect):
 class ByFrequency(Form):
     """What is added or departs, times (frequency / 94 GHz)^``index``.
 
-    A ``foreground`` is not in the maps of a component separation.
+    A ``foreground``, as all that is known by frequencies, is not in the maps of a component separation.
     """
 
     index: ClassVar[float] = 0.0

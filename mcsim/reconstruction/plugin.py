@@ -104,8 +104,7 @@ def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plug
         or values.get("wave") in ("sky", "orientation")  # psi is counted from the meridian of the maps
     )
     frame = {"frame": scene.frame} if framed else {}
-    index = structure.index
-    shared = {} if index is None else {"index": index, "foreground": structure.stage == "added"}
+    shared = {} if structure.index is None else {"index": structure.index, "foreground": True}
     return Plugin(name, base, structure.channel or scene.channels[0], {**scope, **frame, **values, **shared})
 
 

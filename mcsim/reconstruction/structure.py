@@ -35,12 +35,12 @@ class Structure:
     #: "added", "gain", "elsewhere", "beam", "square", "cube", "rotation", "noise", "power" or "modulation"
     stage: str
     acts_on: str  #: what it multiplies: "sky", "dipole", "sky and dipole", or "" if nothing
-    frame: str  #: "sky", "scan", "spacecraft", "time", or "" for noise and for the sky's own power
+    frame: str  #: "sky", "scan", "spacecraft", "time", "Sun", or "" for noise and for the sky's own power
     #: what varies: "monopole", "degrees 0-2", "latitude ecliptic", "order 2", "year", "spin 1", "constant", ...
     kind: str
     channel: str | None  #: name; None: all of them
     split: str  #: "alike", "opposite", or the name of the only split that has it
-    index: float | None  #: power of the frequency of what is added to all channels; None: it is not scaled
+    index: float | None  #: power of the frequency with which channels share it; None: it is not scaled
     #: rows, weights: places of the scores, shape (K, maps), and the factor of each map, shape (maps,): a score of the
     #: structure is their weighted sum over maps
     rows: NDArray[np.int64] = field(repr=False)

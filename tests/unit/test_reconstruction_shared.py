@@ -20,18 +20,22 @@ from mcsim.simulation.survey import survey
 SMALL = {"lmax": 16, "nside": 8, "fwhm_arcmin": 600.0, "period_s": 3011.0}
 
 
-def test_foregrounds_are_in_all_maps_but_those_of_a_component_separation():
+def test_what_frequencies_share_is_in_all_maps_but_those_of_a_component_separation():
     """Beside these what V1 and W1 have alike is told, too, which without them would be the sky itself."""
     table = two_channels("foregrounds", **SMALL)
     table["channel"].append(table["channel"][0] | {"name": "CMB", "frequency_ghz": 143.0, "foregrounds": False})
     run = config.load(table)
     scene = simulated_scores.scene_of(model_of(survey(run, orders=2), DiagnosisSettings()))
-    for index, says in ((0.0, "alike in these"), (1.5, "as the frequency to the power 1.5")):
-        told = ("quadrupole", None, ALIKE, index)
+    for index, says, what in (
+        (0.0, "alike in these", "quadrupole"),
+        (1.5, "as the frequency to the power 1.5", "quadrupole"),
+        (GROWTH, "as the frequency to the power 2", "constant"),
+    ):
+        told = (what, None, ALIKE, index)
         (found,) = (one for one in structures(scene) if one.says[3:] == told)
         assert found.views == (0, 1, 2, 3)
-        assert says in words.says(found, np.ones(5), scene)
-        kind = plugin("unlisted_1", found, np.ones(5), scene).kind()
+        assert says in words.says(found, np.ones(found.size), scene)
+        kind = plugin("unlisted_1", found, np.ones(found.size), scene).kind()
         effect = config.Effect(name="unlisted_1", parameters={"amplitude": 1.0})
         acting = survey(replace(run, effects=(effect,)), library={"unlisted_1": kind})
         pairs = zip(simulate.maps(acting, 0), simulate.maps(survey(run), 0), strict=True)
