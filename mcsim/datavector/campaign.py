@@ -44,7 +44,7 @@ have; of more modes over fewer, as each sky tells as much more."""
 LOOKED_AT = 500
 """Simulations from which on it is measured what their covariance is worth: of fewer the number scatters too much."""
 
-LEAST, STEP = 1.25, 0.25  #: simulations per element at the first look, and between two
+LEAST, STEP = 1.25, 0.25  #: simulations per element at the first look, and between two at most
 
 FEWEST = 2  #: skies over which any response is averaged: their scatter is its error
 
@@ -329,8 +329,10 @@ def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool
     if source is not None and stored is not None and stored < settings.sims_per_element * independent:
         raise _too_few(source, independent, settings.sims_per_element)
     if ends_early and few >= LOOKED_AT:
-        while few < enough and _worth(analysis, drawn) < settings.worth_per_element * independent:
-            few += math.ceil(STEP * independent)
+        wanted = settings.worth_per_element * independent
+        while few < enough and (worth := _worth(analysis, drawn)) < wanted:
+            # About as many as lack if each is worth the same, but a task at least.
+            few += math.ceil(min(STEP * independent, max(few * (wanted / worth - 1.0), PER_TASK)))
             found |= run([one for one in jobs if one not in found and one.kind == "null" and one.number < few])
             drawn = _drawn(found, size)
         enough = min(few, enough)

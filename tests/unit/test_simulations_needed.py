@@ -53,6 +53,16 @@ def test_simulations_end_when_their_covariance_is_worth_enough(four: Analysis) -
     assert many - 3 * size in range(campaign.PER_TASK)
 
 
+def test_only_as_many_simulations_follow_as_lack(four: Analysis, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hundred at once are made where many lack, and otherwise the few that are worth the rest."""
+    size, rng = len(four.elements), np.random.default_rng(6)
+    for share, expected in ((1.03, 520), (1.001, 510), (1.5, 750)):
+        each = four.settings.worth_per_element * size / (share * campaign.LOOKED_AT)
+        monkeypatch.setattr(campaign, "_worth", lambda _, drawn, each=each: int(each * len(drawn)) + 1)
+        made = counted(four, lambda count: rng.standard_normal((count, size)))
+        assert made - expected in range(campaign.PER_TASK), share
+
+
 def test_skies_of_many_modes_tell_as_much_in_fewer(four: Analysis) -> None:
     """Twice the modes, half of the skies, down to two, with the opposite step in a third of them."""
     one = next(each for each in four.candidates if each.name == "dipole_modulation")
