@@ -60,6 +60,7 @@ class Spectra:
         bins = sorted({(row.ell_min, row.ell_max) for row in self.rows})
         normalisation = "Bennett" if self.scaling.bennett else "Hajian-Souradeep"
         scale = f"{normalisation} times {'l(l+1)/2pi' if self.scaling.spectrum else '1'}"
+        scale += "" if self.highest is None else f", of maps up to l = {self.highest}"
         found = []
         for (mode, low, high, imaginary), pair in zip(self.rows, self.pairs, strict=True):
             part, words = "imaginary" if imaginary else "real", f"L = {mode.L}, M = {mode.M}, d = {mode.d}"

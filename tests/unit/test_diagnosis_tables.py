@@ -131,6 +131,18 @@ def test_power_spectra_are_those_of_the_pair(tmp_path):
     assert [element.fold for element in spectra.elements[: len(BINS)]] == [0, 1, 0, 1, 0, 1]
 
 
+def test_where_the_maps_end_is_part_of_what_a_number_is(tmp_path):
+    """Simulations of tables whose maps end elsewhere are other numbers, and kept in the cache by these names."""
+    table = measured(RUN)
+    whole = read(tmp_path, table)
+    table.meta["lmax"] = 37
+    cut = read(tmp_path, table)
+    run = tables.estimator_for(RUN, whole)
+    one, other = (spectra(Job(config.to_json(run), config.to_json(run), 0, 1)) for spectra in (whole, cut))
+    assert not np.allclose(one, other)
+    assert {element.name for element in whole.elements}.isdisjoint(element.name for element in cut.elements)
+
+
 def test_other_frames_are_those_of_rotated_coefficients(tmp_path):
     spectra = read(tmp_path, measured(RUN))
     views = list(spectra.views())
