@@ -207,7 +207,7 @@ def skies(analysis: Analysis, candidate: Candidate, sign: int = 1) -> int:
     """Return the number of skies over which the response to a candidate is averaged, or those of one sign."""
     settings = analysis.settings
     if not analysis.of_maps:
-        return settings.table_skies
+        return min(settings.table_skies, settings.noisy_skies)
     if candidate.random_response:
         return settings.noisy_skies
     fewest = settings.channel_skies

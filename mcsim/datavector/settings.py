@@ -104,7 +104,7 @@ class DiagnosisSettings:
     opposite_share
         Share of these skies in which the opposite step is simulated too; the others take its curvature from these.
     table_skies
-        Skies over which the response of measured spectra is averaged.
+        Skies over which the response of measured spectra is averaged, ``noisy_skies`` at most.
     constrained_skies, scatter_skies
         Skies, constrained by the data, on which fitted effects are simulated; the same for the scatter of stochastic
         effects.

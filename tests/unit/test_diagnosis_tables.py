@@ -1,6 +1,7 @@
 """Tables of measured spectra: named where an effect is in them, silent where none is, refused where they cannot be."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from mcsim.datavector import campaign
 from mcsim.datavector import spectra_table as tables
 from mcsim.datavector.analysis import Job
 from mcsim.datavector.campaign import with_effects
+from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.spectra_table import read_spectra
 from mcsim.diagnosis import report
 from mcsim.diagnosis.context import context
@@ -141,6 +143,13 @@ def test_where_the_maps_end_is_part_of_what_a_number_is(tmp_path):
     one, other = (spectra(Job(config.to_json(run), config.to_json(run), 0, 1)) for spectra in (whole, cut))
     assert not np.allclose(one, other)
     assert {element.name for element in whole.elements}.isdisjoint(element.name for element in cut.elements)
+
+
+@pytest.mark.parametrize("changes", [{}, {"table_skies": 50}])
+def test_responses_are_averaged_over_skies_that_are_simulated_without_effects(changes):
+    settings = DiagnosisSettings.quick(**changes)
+    analysis = SimpleNamespace(of_maps=False, settings=settings)
+    assert campaign.skies(analysis, None) == settings.noisy_skies == 12
 
 
 def test_other_frames_are_those_of_rotated_coefficients(tmp_path):
