@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from mcsim.datavector.candidate import Column, TemplateBank
 from mcsim.datavector.summaries import Element, pair_classes
 from mcsim.ensemble.store import write_dataset
-from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.stats.gaussian import SimulatedGaussian, held_out_pvalues
 from mcsim.support.arrays import Matrix, Vector, divided
 
 QUADRATIC = 0.05  #: share of an element's variance that may come from squares and products of nuisances
@@ -77,6 +77,10 @@ class NullEnsemble:
         whitening = np.zeros((wide.dimension, len(tested)))
         whitening[:, tested] = wide.whitening @ kept
         return replace(wide, mean=self.simulations.mean(axis=0) + self.offset, whitening=whitening)
+
+    def held_out_pvalues(self, null: SimulatedGaussian) -> Vector:
+        """Return the p-value of every simulation, of a single sky each, against all others, shape (N,): uniform."""
+        return held_out_pvalues(self.simulations, replace(null, scale_variance=self.skies * null.scale_variance))
 
     @cached_property
     def tested(self) -> NDArray[np.bool_]:

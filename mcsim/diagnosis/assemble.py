@@ -16,7 +16,7 @@ from mcsim.diagnosis.selection import Explanation
 from mcsim.errors import InputError
 from mcsim.stats.detection import detectable, snr_needed, snr_to_separate
 from mcsim.stats.excess import HeldOut, excess_of
-from mcsim.stats.gaussian import Fit, held_out_pvalues
+from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Vector
 
 TELLING = 12  #: elements that are named where two sets differ
@@ -56,7 +56,7 @@ def result_of(
         standard_deviation=ensemble.simulations.std(axis=0, ddof=1),
         templates=refined.templates,
         correlation=found.correlation,
-        held_out_pvalues=held_out_pvalues(ensemble.simulations, null),
+        held_out_pvalues=ensemble.held_out_pvalues(null),
         calibration=context.calibration.combined,
         residual_maps=residuals,
         residual_range=None if residuals is None else np.quantile(ensemble.residual_rms, [0.025, 0.975], axis=0).T,

@@ -15,7 +15,6 @@ from mcsim.diagnosis.result import Agreement
 from mcsim.ensemble.external import named_source, source_of
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
-from mcsim.stats.gaussian import held_out_pvalues
 from mcsim.stats.look_elsewhere import global_test
 
 
@@ -85,7 +84,7 @@ def agreement(known: DiagnosisContext) -> Agreement:
     assert source is not None
     null = ensemble.of_mean(len(ensemble.reference)).gaussian
     groups = null.whiten_groups(known.templates, [one.columns for one in known.candidates])
-    others, found = held_out_pvalues(ensemble.simulations, known.null), []
+    others, found = ensemble.held_out_pvalues(known.null), []
     offset = np.zeros(len(null.mean)) if ensemble.own_offset is None else ensemble.own_offset
     for shift in [offset, 0.0 * offset][: 1 + int(offset.any())]:
         own = ensemble.reference + shift

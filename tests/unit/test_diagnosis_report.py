@@ -3,7 +3,7 @@
 import json
 import re
 from dataclasses import fields, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -101,6 +101,7 @@ def bench(nearest_candidates: bool) -> SimpleNamespace:
     """What the five cases have in common."""
     candidates, t = proposals(), RESPONSE * templates(nearest_candidates)
     simulations = np.random.default_rng(10).normal(size=(N, P))
+    held = {"simulations": simulations, "held_out_pvalues": partial(held_out_pvalues, simulations)}
     model = SimulatedGaussian.from_simulations(simulations)
     spread = np.random.default_rng(12).normal(size=(5, 2))
     fiducial = SimpleNamespace(frame="ecliptic", parts=[SimpleNamespace(name=name) for name in (EVIL, "V")])
@@ -108,7 +109,7 @@ def bench(nearest_candidates: bool) -> SimpleNamespace:
         run=replace(config.load(resources.workflow("quickstart")), name=EVIL),
         analysis=SimpleNamespace(elements=tuple(elements()), model=fiducial),
         settings=DiagnosisSettings(beam_bins=(5, 2, 2, 1, 1), place_pvalue=0.0123),
-        ensemble=SimpleNamespace(simulations=simulations, residual_rms=1.0 + 0.1 * spread, nuisances=None),
+        ensemble=SimpleNamespace(**held, residual_rms=1.0 + 0.1 * spread, nuisances=None),
         null=model,
         candidates=candidates,
         calibration=calibrate(

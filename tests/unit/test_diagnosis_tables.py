@@ -6,14 +6,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from astropy.table import Table
+from scipy.stats import kstest
 
 from mcsim import bipolar, config, systematics
 from mcsim.datavector import campaign
 from mcsim.datavector import spectra_table as tables
 from mcsim.datavector.analysis import Job
 from mcsim.datavector.campaign import with_effects
+from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.spectra_table import read_spectra
+from mcsim.datavector.summaries import Element
 from mcsim.diagnosis import report
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
@@ -120,6 +123,16 @@ def test_the_mean_of_skies_scatters_as_the_tests_take_it_to(small):
     # C (1/R + 1/N), C measured with 300 simulations: 8 % each, 5 sigma.
     np.testing.assert_allclose(scale, 1 / 50 + 1 / len(raw), rtol=0.4)
     np.testing.assert_allclose(np.mean(scale), 1 / 50 + 1 / len(raw), rtol=0.1)
+
+
+def test_simulations_held_out_of_a_mean_are_of_single_skies():
+    """Each has the scale of its own sky, of variance 0.1, where that of a mean of 25 skies has a 25th of it."""
+    draw, none = np.random.default_rng(3), np.zeros((0, 0))
+    scale = draw.chisquare(20, size=(1000, 1)) / 20
+    elements = tuple(Element(str(number), "cl", ("W1",)) for number in range(20))
+    rows = np.sqrt(scale) * draw.normal(size=(1000, 20))
+    mean = NullEnsemble(rows, np.zeros(20), elements, np.zeros((2, 20)), none, none, none, none).of_mean(25)
+    assert kstest(mean.held_out_pvalues(mean.gaussian), "uniform").pvalue > 1e-3
 
 
 def test_power_spectra_are_those_of_the_pair(tmp_path):
