@@ -139,16 +139,19 @@ def _refined(run: config.RunConfig, finer: int, lmax: int) -> config.RunConfig:
     return replace(run, sky=sky, map=pixels, channels=channels, biposh=biposh)
 
 
-def draw(run: str, library: Kinds, sample_by_sample: bool, realization: int, folder: str) -> None:
-    """Draw the maps of a control into a folder that appears complete or not at all; the task of a worker."""
+def draw(run: str, content: str, library: Kinds, sample_by_sample: bool, realization: int, folder: str) -> None:
+    """Draw the maps of a control into a folder that appears complete or not at all; the task of a worker.
+
+    ``content``: hash of the run and of its files, which may have changed since the worker read them.
+    """
     with folders.appearing(Path(folder)) as scratch:
-        shared = _survey(run, library).at(realization)
+        shared = _survey(run, content, library).at(realization)
         every = sampled.maps(shared, realization) if sample_by_sample else enumerate(simulate.maps(shared, realization))
         write_npy(scratch / "maps.npy", np.stack([map_uk for _, map_uk in every]))
 
 
 @lru_cache(maxsize=1)
-def _survey(run: str, library: Kinds) -> DisturbedSurvey:
+def _survey(run: str, content: str, library: Kinds) -> DisturbedSurvey:
     """Keep the survey of the last controls; each draws its own nuisances."""
     return DisturbedSurvey.of(config.from_json(run), dict(library))
 
@@ -168,7 +171,7 @@ def diagnose_controls(known: DiagnosisContext, key: str, count: int, call: Batch
     folder = folders.default_cache_dir().absolute() / "controls" / hashlib.sha256(text.encode()).hexdigest()[:32]
     missing = [number for number in range(count) if not _verdict(folder, number).is_file()]
     absent = [number for number in missing if not _maps(folder, number).is_dir()]
-    fixed = config.to_json(drawn.run), known.analysis.library, drawn.sample_by_sample
+    fixed = config.to_json(drawn.run), config.digest(drawn.run), known.analysis.library, drawn.sample_by_sample
     done = count - len(missing)
     with reporting("controls", float(count), "controls", quiet) as report, asking(call, quiet=True) as ask:
 

@@ -9,7 +9,7 @@ import pytest
 
 import mcsim
 from mcsim import cli, config
-from mcsim.datavector.analysis import analysis_of
+from mcsim.datavector.analysis import analysis_of, kinds_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import controls, words
 from mcsim.diagnosis.api import describe
@@ -103,7 +103,7 @@ def test_controls_are_drawn_once_and_go_on_after_a_kill(sound, client, monkeypat
     found, _ = sound
     drawn, diagnosed_ = [], controls.diagnose_data
     draw = controls.draw
-    monkeypatch.setattr(controls, "draw", lambda *all_: (drawn.append(all_[3]), draw(*all_)))
+    monkeypatch.setattr(controls, "draw", lambda *all_: (drawn.append(all_[4]), draw(*all_)))
     assert diagnosed(model(50), None, 2).controls.members == found.controls.members[:2]
     assert drawn == []
 
@@ -142,11 +142,26 @@ def test_a_known_scan_is_drawn_sample_by_sample(tmp_path):
     assert found.run.sky.lmax > 45
     assert found.samples == analysis.model.survey.making.channels[0].maps[0].moments.hits.sum()
     for by_sample in (True, False):
-        controls.draw(config.to_json(found.run), analysis.library, by_sample, 0, str(tmp_path / str(by_sample)))
+        controls.draw(config.to_json(found.run), "", analysis.library, by_sample, 0, str(tmp_path / str(by_sample)))
     one, other = (np.load(tmp_path / name / "maps.npy")[0] for name in ("True", "False"))
     noise = analysis.model.survey.channels[0].maps[0].noise_uk
     # The same sky and other noise: 768 pixels give its rms to 2.6 %; what the samples see within a pixel is less.
     assert np.sqrt(np.mean((one - other) ** 2 / (2.0 * noise**2))) == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_file_that_has_changed_is_read_again(tmp_path):
+    """Four times the power of the sky is twice its maps, in the process that drew the first one, too."""
+    run, rms = model(45), []
+    ell = np.arange(2, 46)
+    run = replace(
+        run, sky=replace(run.sky, spectrum=str(tmp_path / "cl.txt")), channels=(run.channels[0].without_noise(),)
+    )
+    for factor in (1.0, 4.0):
+        np.savetxt(tmp_path / "cl.txt", np.stack([ell, factor * 1e3 / (ell * (ell + 1))], axis=1))
+        folder = tmp_path / f"{factor:g}"
+        controls.draw(config.to_json(run), config.digest(run), kinds_of(None), False, 0, str(folder))
+        rms.append(np.std(np.load(folder / "maps.npy")))
+    assert rms[1] == pytest.approx(2.0 * rms[0], rel=1e-9)
 
 
 def test_controls_fail_by_one_p_value_or_by_all():
