@@ -81,9 +81,13 @@ SAMPLES = 200_000  #: of a map, about, by which directions elsewhere are known
 VISITS = 2_000_000  #: of a map, about, by which it is known when each pixel is observed
 
 CODE = (
-    *("config", "sphere", "instrument", "systematics", "simulation"),
+    *("config", "sphere", "instrument", "systematics", "bipolar", "simulation"),
     *(f"reconstruction.{name}" for name in ("choices", "forms", "periods", "scores", "simulated_scores", "sources")),
-    *(f"datavector.{name}" for name in ("analysis", "matched_filters", "wiener_filter")),
+    "reconstruction.sky_changes",
+    *(
+        f"datavector.{name}"
+        for name in ("analysis", "matched_filters", "pixel_noise", "untouched_maps", "wiener_filter")
+    ),
 )
 """What scores of simulations are computed with."""
 

@@ -13,6 +13,7 @@ from mcsim import config
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import api
+from mcsim.reconstruction import simulated_scores
 from mcsim.support import resources
 
 SOURCE = """
@@ -68,6 +69,25 @@ def test_a_constant_of_any_package_that_computes_is_learned_anew(plugin, monkeyp
     text = "".join(path.read_text() for name in api.CODE for path in (folder / name).rglob("*.py"))
     used = set(re.findall(r"^ *from mcsim(?:\.| import )(\w+)", text, re.MULTILINE))
     assert {f"mcsim.{name}" for name in used - NOTHING_COMPUTED} <= read
+
+
+NO_SCORE = {
+    *("ensemble", "errors", "stats", "support"),
+    *(f"reconstruction.{name}" for name in ("grammar", "search", "structure")),
+    *(f"datavector.{name}" for name in ("bipolar_scan", "campaign", "candidate", "map_checks", "slices", "summaries")),
+    "datavector.settings",
+}
+"""What is imported where scores of simulations are made, and makes none of them; settings are in the key by value."""
+
+
+def test_scores_are_made_anew_with_other_code_of_any_module_that_makes_them():
+    folder, used = Path(api.__file__).parents[1], set()
+    for name in simulated_scores.CODE:
+        path = folder / name.replace(".", "/")
+        for file in path.rglob("*.py") if path.is_dir() else [path.with_suffix(".py")]:
+            found = re.findall(r"^from mcsim(?:\.(\w+))?(?:\.| import )(\w+)", file.read_text(), re.MULTILINE)
+            used |= {".".join(one) if one[0] in ("reconstruction", "datavector") else one[0] or one[1] for one in found}
+    assert used - NO_SCORE <= set(simulated_scores.CODE)
 
 
 @pytest.mark.parametrize("field", fields(DiagnosisSettings), ids=lambda field: field.name)
