@@ -92,7 +92,7 @@ class Attribution:
         kept = {one.members: place for place, one in enumerate(explanations)}
         places = [kept.get(one.members) for one in self.explanations]
         contrasts = tuple(
-            replace(one, first=first, second=second)
+            replace(one, first=min(first, second), second=max(first, second))
             for one in self.contrasts
             if (first := places[one.first]) is not None and (second := places[one.second]) is not None
         )

@@ -15,7 +15,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import words
 from mcsim.diagnosis.inference import confirmed
 from mcsim.diagnosis.refine import PartialExplanation, Refiner
-from mcsim.diagnosis.selection import Attribution, attribute
+from mcsim.diagnosis.selection import Attribution, Contrast, attribute
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.stats.excess import HeldOut, Measured
 from mcsim.stats.gaussian import SimulatedGaussian
@@ -106,6 +106,16 @@ def test_up_to_six_effects_are_found_at_once(bench, size):
     right = [one for one in found if any(set(e.members) == set(members) for e in one.explanations)]
     # 95 % less three sigma.
     assert len(right) >= 16
+
+
+def test_contrasts_are_of_the_sets_in_their_new_order(bench):
+    """The report tells the first set from each further one, whichever of them was the first before."""
+    found = bench.diagnose_maps(12.0 * bench.t[:, 3], 1)
+    (one,) = found.explanations
+    sets = tuple(replace(one, members=(member,)) for member in range(3))
+    contrasts = tuple(Contrast(first, second, 1.0, (), ()) for first, second in combinations(range(3), 2))
+    kept = replace(found, explanations=sets, contrasts=contrasts).of([sets[2], sets[0]])
+    assert [(each.first, each.second) for each in kept.contrasts] == [(0, 1)]
 
 
 def test_sets_that_grow_are_those_of_a_search_of_all():
