@@ -82,8 +82,9 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         size, skies, library = len(self.x), self.context.settings.constrained_skies, dict(self.context.analysis.library)
         alone = all(library[effect.name].parametrization.noise_alone for effect in found)
         if alone or any(self.same_skies.skies_of(effect) == "reference" for effect in found):
-            after = self.same_skies.of_reference(found, skies if alone else None)[:, :size]
-            return self.context.reference(found)[: len(after)], after
+            before = self.context.reference(found)
+            after = self.same_skies.of_reference(found, min(skies, len(before)) if alone else None)[:, :size]
+            return before[: len(after)], after
         before, after = self.same_skies.pair(found, skies, True)
         return before[:, :size], after[:, :size]
 

@@ -12,6 +12,8 @@ from mcsim import config, systematics
 from mcsim.datavector.analysis import analysis_of, data_vectors
 from mcsim.datavector.campaign import with_effects
 from mcsim.datavector.same_skies import SameSkies
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 
@@ -116,3 +118,18 @@ def test_the_sky_of_maps_with_an_ellipse_is_found_through_it() -> None:
         assert left < 0.3 * off
     slight = [config.Effect(name="beam_ellipticity", channel="W1", parameters={"amplitude": 0.02})]
     assert skies.seen(slight) == ((), ())
+
+
+def test_noise_alone_is_compared_in_as_many_skies_as_there_are_without_it() -> None:
+    """More skies may be constrained by data than there are of responses that are random."""
+    settings = DiagnosisSettings.quick(constrained_skies=16)
+    context = SimpleNamespace(
+        settings=settings,
+        analysis=SimpleNamespace(library=tuple(systematics.catalogue().items())),
+        reference=lambda found: np.zeros((settings.noisy_skies, 3)),
+    )
+    data = ObservedMaps(context, (), list)  # type: ignore[arg-type]
+    vars(data)["_measured"] = (np.zeros(3),)
+    vars(data)["same_skies"] = SimpleNamespace(of_reference=lambda found, skies: np.ones((skies, 4)))
+    before, after = data.pair([config.Effect(name="noise_level", channel="W1")])
+    assert before.shape == after.shape == (settings.noisy_skies, 3)
