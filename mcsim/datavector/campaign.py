@@ -153,7 +153,8 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
     for candidate, column, sign, effect in _steps(analysis):
         table = candidate.table(effect)
         acting = replace(analysis.job(with_effects(base, [table])), source=analysis.source_of([table]))
-        jobs[Purpose("response", column, sign)] = replace(acting, count=skies(analysis, candidate, sign))
+        if count := skies(analysis, candidate, sign):
+            jobs[Purpose("response", column, sign)] = replace(acting, count=count)
     return {purpose: replace(job, slices=analysis.of_maps) for purpose, job in jobs.items()}
 
 

@@ -75,3 +75,12 @@ def test_skies_of_many_modes_tell_as_much_in_fewer(four: Analysis) -> None:
         own = replace(four, model=replace(model, lmax=lmax, sky_power=power, settings=settings))
         assert campaign.skies(own, one) == expected
         assert campaign.skies(own, one, -1) == -(-expected // 3)
+
+
+def test_without_a_share_of_opposite_steps_none_is_simulated(four: Analysis) -> None:
+    settings = replace(four.settings, opposite_share=0.0)
+    jobs = campaign.plan(replace(four, model=replace(four.model, settings=settings)), 300, time_ordered=False)
+    assert all(job.count for job in jobs.values())
+    assert {(purpose.number, purpose.sign) for purpose in jobs if purpose.kind == "response"} == {
+        (column, one.parametrization.sign or 1) for one in four.candidates for column in one.columns
+    }
