@@ -246,7 +246,7 @@ def _noise_block(model: Model, channel: int) -> Block:
         own = Element(f"noise/{name}/{low:g}-{high:g}/pixels{half}", "noise", (name,), fold=half, L=0, kind="noise")
         words = f"|sin β| {low:g}–{high:g}, {'odd' if half else 'even'} pixels"
         elements.append(replace(own, frame="ecliptic", component=words))
-    bands = np.stack(rows)
+    bands = np.reshape(rows, (-1, height.size))  # none, if two maps have no pixel in common
     return Block(tuple(elements), lambda filtered: np.asarray(bands @ filtered.difference[channel]))
 
 

@@ -1,5 +1,7 @@
 """Elements of the data vector whose answers to a change of the maps are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,8 @@ from instruments import two_channels
 from mcsim import config
 from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.summaries import Element, pair_classes, ranges_within
+from mcsim.datavector.summaries import Element, blocks_of, pair_classes, ranges_within
+from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.systematics import catalogue
@@ -102,3 +105,18 @@ def test_pairs_are_of_one_class_whichever_channels_and_splits_they_are_of():
     ):
         assert not same(("V1half102", "V1half112"), (one, other))
     assert not same(("V1a", "W1a"), ("V1a", "W1b"))
+
+
+def test_maps_without_a_pixel_in_common_have_no_noise_of_their_difference(analysis) -> None:
+    """Such as those of two masks: in the place of the numbers there are none."""
+    north = np.arange(12 * 16**2) < 6 * 16**2
+    parts = [
+        replace(part, precision=np.where(north == (number % 2 == 0), part.precision, 0.0))
+        for number, part in enumerate(analysis.model.parts)
+    ]
+    model = replace(analysis.model, parts=tuple(parts), inverse=None)
+    maps = list(simulate.maps(survey(analysis.run), 0))
+    blocks, filtered = blocks_of(model), wiener_filter(model, maps)
+    assert "noise" not in {element.kind for block in blocks for element in block.elements}
+    for block in blocks:
+        assert np.size(block.values(filtered)) == len(block.elements)
