@@ -16,8 +16,10 @@ EXTRA_ORDERS = 3  #: moments beyond the beam's orders: a displaced beam has them
 
 
 def quiet(run: config.RunConfig) -> config.RunConfig:
-    """Return the run without noise and effects, and with nothing to estimate; InputError for splits by rings."""
+    """Return the run without noise and effects, and with nothing to estimate; InputError without pixels, for rings."""
     check_splits(run)
+    if run.map.grid != "healpix":
+        raise InputError(f'{run.name} has map.grid = "{run.map.grid}" and so no pixels; set map.grid = "healpix".')
     run = named_source(run)[0]
     channels = tuple(channel.without_noise() for channel in run.channels)
     biposh = replace(run.biposh, L_max=0, pairs="auto", filter="none", probes=None)

@@ -247,8 +247,6 @@ def _model(
     if run.effects and model is None and found == own[0] and (own[1] == b or Path(own[1]).is_file()):
         other = config.load(own[1])
         found, run = (found, run) if other.effects else (own[1], other)  # a description has none
-    if run.map.grid != "healpix":
-        raise InputError(f'{run.name} has map.grid = "{run.map.grid}" and so no pixels; set map.grid = "healpix".')
     return run, str(found), model is None and found == own[1] != own[0]
 
 

@@ -216,6 +216,13 @@ def test_what_cannot_be_compared_is_refused(a, b, model):
         mcsim.compare(a, b, model)
 
 
+def test_a_model_without_pixels_is_refused():
+    channel = {**MODEL["channel"][0], "scan": {"kind": "parallel_transport"}}
+    run = config.load({**MODEL, "map": {"grid": "gl"}, "channel": [channel]})
+    with refused("map.grid", "gl", "healpix"):
+        mcsim.compare([np.zeros(12)], [np.ones(12)], run)
+
+
 def test_a_run_is_simulated_sample_by_sample_where_the_other_side_is(tmp_path):
     """Samples spread over their pixels: the moments of the default simulation miss a few per cent of the sky."""
     simulator = Simulator(small("litebird", mcsim.Beam.gaussian(380.0, 32), period_s=631.0))
