@@ -209,8 +209,13 @@ class Scene:
     @cached_property
     def continua(self) -> list[tuple[int, float]]:
         """Return of each of :meth:`peaks` its coordinates, and among how many independent ones it is chosen."""
-        periods = [(2, line.tried) for line in self.time_lines for _ in PERIODIC]
+        periods = [(2, self.time_lines[c].tried) for c, _ in self._periodic]
         return periods + [(1, self.places) for _ in self._groups]
+
+    @property
+    def _periodic(self) -> list[tuple[int, str]]:
+        """Return channel and what a wave multiplies of each periodogram; none of surveys too short for any period."""
+        return [(c, on) for c, line in enumerate(self.time_lines) if line.tried >= 1.0 for on in PERIODIC]
 
     @property
     def places(self) -> float:
@@ -227,8 +232,7 @@ class Scene:
         """Return what stands out most of every continuum: periods of a channel, added and of its gain, and sources."""
         residual, whole = filtered.residual, filtered.expected + self.dipole
         products = dict(zip(PERIODIC, (residual, residual * whole), strict=True))
-        each = ((c, on) for c in range(len(self.time_lines)) for on in PERIODIC)
-        found = [self.time_lines[c].peak(on, [products[on][i] for i in self.of(c)]) for c, on in each]
+        found = [self.time_lines[c].peak(on, [products[on][i] for i in self.of(c)]) for c, on in self._periodic]
         return found + list(map(sources.brightest, self.bright(filtered), self.spreads))
 
     def bright(self, filtered: FilteredMaps) -> list[Map]:
@@ -241,9 +245,8 @@ class Scene:
         """Return the scene with the variances of the scores of sources, by simulations of the model."""
         each = [sources.variance(view.precision, view.response, self.nside, self.lmax) for view in self.views]
         noise = [np.sum([each[i] for i in group], axis=0) for group in self._groups]
-        found = [self.bright(one) for one in drawn]
-        each_own = ((own, [one[k] for one in found]) for k, own in enumerate(noise))
-        return replace(self, spreads=tuple(sources.simulated_variance(*one) for one in each_own))
+        scores = zip(*map(self.bright, drawn), strict=True)
+        return replace(self, spreads=tuple(map(sources.simulated_variance, noise, scores)))
 
     def values(self, filtered: FilteredMaps) -> Vector:
         """Return the scores, shape (len(keys),)."""

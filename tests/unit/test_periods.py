@@ -6,6 +6,7 @@ from scipy import stats
 from scipy.sparse import csr_matrix
 
 from mcsim.reconstruction.periods import DRAWS, FEWEST, SPANS, TimeLine
+from mcsim.reconstruction.scores import PERIODIC, Scene
 
 SPAN_S, COUNT, PIXELS, EACH = 300.0, 4000, 500, 5
 NOISE = 4.0  #: variance of the products of residuals
@@ -69,3 +70,16 @@ def test_the_wrong_variance_is_seen(line):
     noise = [np.sqrt(2.0 * NOISE) * draw.normal(size=PIXELS) for _ in range(100)]
     ratio = np.mean([line.power([one])[100:2000] / line.variance[""][100:2000] for one in noise])
     assert abs(ratio - 2.0) < 4.0 * 2.0 * np.sqrt(1.0 / 100 + 1.0 / DRAWS) / np.sqrt(PIXELS)
+
+
+@pytest.mark.parametrize(("spans", "looked_for"), [(16, False), (18, True)])
+def test_no_period_is_looked_for_in_a_survey_of_an_hour(spans, looked_for):
+    """A period is told by FEWEST cycles of the shortest one, a quarter of an hour, and one more to choose among."""
+    visits = csr_matrix(np.full((spans, 12), 1.0 / spans))
+    line = TimeLine.of((visits,), SPAN_S, {on: [np.ones(12)] for on in PERIODIC})
+    empty = np.zeros(0)
+    scene = Scene(
+        ("W",), (None,), ("",), (True,), "ecliptic", 1, 2, np.zeros(3), empty, empty, 1, (), (), False, (line,)
+    )
+    assert len(scene.continua) - 1 == 2 * looked_for
+    assert np.isfinite(np.log([tried for _, tried in scene.continua])).all()
