@@ -52,8 +52,8 @@ class NotCompared:
     @property
     def words(self) -> str:
         """Name, and what lacks it."""
-        where = "the model" if self.missing_on == ("model",) else f"side {' and side '.join(self.missing_on).upper()}"
-        return f"{self.map}, which {where} lacks"
+        where = " and ".join("the model" if side == "model" else f"side {side.upper()}" for side in self.missing_on)
+        return f"{self.map}, which {where} {'lacks' if len(self.missing_on) == 1 else 'lack'}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as in ``compare.json``."""

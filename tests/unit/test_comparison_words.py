@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mcsim.comparison.effects import EffectDifference
-from mcsim.comparison.result import DifferenceResult
+from mcsim.comparison.result import DifferenceResult, NotCompared
 from mcsim.systematics.beams import BeamSidelobe
 
 
@@ -26,3 +26,15 @@ def test_sign_that_misleads_is_explained() -> None:
     assert "ring" in ring.said(np.array([-1e-3, 0.0]))
     assert ring.said(np.array([1e-3, 0.0])) == ""
     assert DifferenceResult("one", "W", -1.0, "K", 1.0, {}, "", "cold").words == "one = −1 K (cold)"
+
+
+@pytest.mark.parametrize(
+    ("missing_on", "words"),
+    [
+        (("a",), "W1, which side A lacks"),
+        (("a", "b"), "W1, which side A and side B lack"),
+        (("model",), "W1, which the model lacks"),
+    ],
+)
+def test_a_map_that_is_not_compared_is_said_to_lack_on_each_side(missing_on, words) -> None:
+    assert NotCompared("W1", missing_on).words == words
