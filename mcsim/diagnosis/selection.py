@@ -88,7 +88,9 @@ class Attribution:
         return replace(self.unexplained(), faint=True)
 
     def of(self, explanations: Sequence[Explanation]) -> "Attribution":
-        """Return the attribution with some of its explanations, in order."""
+        """Return the attribution with some of its explanations, in order, with odds against the best of these."""
+        best = max((one.odds for one in explanations), default=1.0)
+        explanations = tuple(replace(one, odds=one.odds / best) for one in explanations)
         kept = {one.members: place for place, one in enumerate(explanations)}
         places = [kept.get(one.members) for one in self.explanations]
         contrasts = tuple(
@@ -96,9 +98,7 @@ class Attribution:
             for one in self.contrasts
             if (first := places[one.first]) is not None and (second := places[one.second]) is not None
         )
-        return replace(
-            self, verdict=_verdict(False, explanations), explanations=tuple(explanations), contrasts=contrasts
-        )
+        return replace(self, verdict=_verdict(False, explanations), explanations=explanations, contrasts=contrasts)
 
     def unexplained(self) -> "Attribution":
         """Return the same attribution with the verdict "unknown" and no explanation."""

@@ -118,6 +118,16 @@ def test_contrasts_are_of_the_sets_in_their_new_order(bench):
     assert [(each.first, each.second) for each in kept.contrasts] == [(0, 1)]
 
 
+def test_odds_are_against_the_best_of_the_sets_that_stay(bench):
+    """The first set of a report has odds of one against the best, whatever parts of the data contradict."""
+    found = bench.diagnose_maps(12.0 * bench.t[:, 3], 1)
+    (one,) = found.explanations
+    sets = tuple(replace(one, members=(member,), odds=odds) for member, odds in enumerate((1.0, 0.5, 0.25)))
+    assert [each.odds for each in found.of(sets).explanations] == [1.0, 0.5, 0.25]
+    assert [each.odds for each in found.of(sets[1:]).explanations] == [1.0, 0.5]
+    assert found.of(()).explanations == ()
+
+
 def test_sets_that_grow_are_those_of_a_search_of_all():
     """Of three effects among fourteen that are alike, with cosines about 0.5."""
     common = directions(1, 30)
