@@ -29,8 +29,10 @@ def lines(analysis: Analysis, jobs: Mapping[Purpose, Job]) -> list[str]:
     """
     survey = analysis.model.survey
     each_s = min(_seconds(analysis, number) for number in range(2))
-    filtered = wiener_filter(analysis.model, list(simulate.maps(survey, 0)))
-    scan = len(analysis.bipolar_scan.elements) + coarse_residuals(analysis.model, filtered).size
+    scan = 0
+    if analysis.of_maps:
+        filtered = wiener_filter(analysis.model, list(simulate.maps(survey, 0)))
+        scan = len(analysis.bipolar_scan.elements) + coarse_residuals(analysis.model, filtered).size
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)
     own = [m for m in survey.maps if not isinstance(m.moments.w, np.memmap)]
     moments = sum(m.moments.w.nbytes + 3.0 * m.moments.hits.nbytes for m in own)

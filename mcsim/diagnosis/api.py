@@ -188,7 +188,7 @@ def describe(
         head += f"; and at most {given} of {source.label}{stored}, whose own cost is not in what follows"
     priors = [f"nuisance: {line}" for one in analysis.nuisances for line in one.lines]
     lines = [head, *priors, *cost.lines(analysis, planned)]
-    if source is None:
+    if source is None and table is None:
         more = simulated_scores.SIMULATIONS
         lines.append(
             f"if the verdict is unknown: {more} more simulations, once, and again if a period or source is found"

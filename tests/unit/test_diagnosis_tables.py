@@ -17,7 +17,7 @@ from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.spectra_table import read_spectra
 from mcsim.datavector.summaries import Element
-from mcsim.diagnosis import report
+from mcsim.diagnosis import api, report
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.measured_spectra import MeasuredSpectra
@@ -163,6 +163,16 @@ def test_responses_are_averaged_over_skies_that_are_simulated_without_effects(ch
     settings = DiagnosisSettings.quick(**changes)
     analysis = SimpleNamespace(of_maps=False, settings=settings)
     assert campaign.skies(analysis, None) == settings.noisy_skies == 12
+
+
+def test_the_cost_of_a_table_is_that_of_its_numbers(tmp_path):
+    """Of 8 bytes each: tables have no bipolar scan, and nothing that is not listed is looked for in them."""
+    read(tmp_path, measured(RUN))
+    settings = DiagnosisSettings(without=tuple(set(systematics.catalogue()) - set(PROPOSED)), simulations=300)
+    text = api.describe(RUN, settings, tmp_path / "table.ecsv")
+    count, size = (int(text.split(word)[0].split()[-1]) for word in (" simulations before", "\n"))
+    assert f"disk    {8e-6 * count * size:.1f} MB" in text
+    assert "unknown" not in text
 
 
 def test_other_frames_are_those_of_rotated_coefficients(tmp_path):
