@@ -188,7 +188,7 @@ def unlisted(result: DiagnosisResult) -> list[str]:
         return ["No structure that the grammar can say describes it: what is missing stays unknown."]
     found = [one.sentence for one in result.unlisted]
     held = result.unlisted_held_out
-    if all(one.file is None for one in result.unlisted):
+    if result.unlisted[0].file is None:  # the others are what it leaves
         return [*found, "No effect of the simulator can be like it, so that its reduction is not measured."]
     if held is None:
         return [*found, "Its reduction on held-out data is not measured: they do not respond to it by themselves."]

@@ -7,6 +7,7 @@ import pytest
 
 from mcsim import systematics
 from mcsim.datavector.candidate import Candidate
+from mcsim.diagnosis import words
 from mcsim.diagnosis.assemble import effects_of
 from mcsim.support.numbers import duration, measured, number, probability
 
@@ -77,3 +78,12 @@ def test_what_data_do_not_tell_is_no_part_of_an_error():
 )
 def test_durations_are_said_in_a_unit_that_people_use(seconds, words):
     assert duration(seconds) == words
+
+
+@pytest.mark.parametrize(
+    ("files", "why"), [((None, "text"), "No effect of the simulator"), (("text", None), "do not respond to it")]
+)
+def test_a_reduction_that_no_effect_can_make_is_said_so(files, why):
+    """Further structures are what the first one leaves: without an effect of that, none is added."""
+    found = tuple(SimpleNamespace(sentence="Something.", file=file) for file in files)
+    assert why in words.unlisted(SimpleNamespace(unlisted=found, unlisted_held_out=None))[-1]
