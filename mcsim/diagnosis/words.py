@@ -123,9 +123,8 @@ def agreement(found: Agreement) -> str:
     if not found.agrees and found.nearest is not None:
         text += f"; nearest to what {found.simulator} has beside it is {found.nearest}"
     whose = f"those of {', '.join(found.effects)} are {found.simulator}'s" if found.effects else ""
-    if found.agrees:
-        return f"{text}. Responses to effects are mcsim's{f', but {whose}' if whose else ''}."
-    return f"{text}. Responses to effects are mcsim's and approximate{f', but {whose}' if whose else ''}."
+    how = "" if found.agrees else " and approximate"
+    return f"{text}. Responses to effects are mcsim's{how}{f', but {whose}' if whose else ''}."
 
 
 def chi2(result: DiagnosisResult) -> str:
