@@ -291,11 +291,7 @@ def scores(job: Job) -> Matrix:
     each = (filtered(model, maps) for maps in simulated_maps(job))
     if job.chosen:
         return np.stack([scene.chosen_values(one) for one in each])
-    return np.stack([np.append(scene.values(one), _falls(scene, one)) for one in each])
-
-
-def _falls(scene: Scene, maps: FilteredMaps) -> list[float]:
-    return [one.fall for one in scene.peaks(maps)]
+    return np.stack([np.append(scene.values(one), [peak.fall for peak in scene.peaks(one)]) for one in each])
 
 
 def scene_for(job: Job) -> Scene:
