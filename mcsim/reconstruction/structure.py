@@ -1,7 +1,7 @@
 """One structure of the grammar: what it says, and with which scores it is measured."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,9 +147,8 @@ class Structure:
     def within(self, split: int, splits: Sequence[int]) -> "Structure":
         """Return the same, measured in the maps of one split; ``splits`` are those of all maps."""
         kept = [k for k, view in enumerate(self.views) if splits[view] == split]
-        return Structure(
-            *self.says, self.rows[:, kept], self.weights[kept], self.mix, tuple(self.views[k] for k in kept), self.tried
-        )
+        views = tuple(self.views[k] for k in kept)
+        return replace(self, rows=self.rows[:, kept], weights=self.weights[kept], views=views)
 
 
 def _briefly(kind: str) -> list[str]:
