@@ -266,19 +266,13 @@ class Selection:
 
     @cached_property
     def searches(self) -> list[Subsets]:
-        """Return :meth:`_searches`, which share what is computed of each."""
-        return list(self._searches())
-
-    def _searches(self) -> Iterator[Subsets]:
-        """Yield a search of sets without a member whose scatter is known, and one for each combination of such members.
+        """Return a search of sets without a member whose scatter is known, and one of each combination of such members.
 
         Combinations of candidates that exclude each other are left out.
         """
         scatters = [index for index, candidate in enumerate(self.candidates) if candidate.scatter is not None]
-        for size in range(self.settings.max_effects + 1):
-            for members in combinations(scatters, size):
-                if len({self.candidates[index].identity for index in members}) == size:
-                    yield self.search(members)
+        sets = [members for size in range(self.settings.max_effects + 1) for members in combinations(scatters, size)]
+        return [self.search(own) for own in sets if len({self.candidates[k].identity for k in own}) == len(own)]
 
     def search(self, members: Sequence[int]) -> Subsets:
         """Return the search of sets with all of the members whose scatter is known."""
