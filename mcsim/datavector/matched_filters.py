@@ -110,11 +110,7 @@ def _signal_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
     """Correlate residuals with the mean of what is added to the samples of every pixel."""
     site, parts = model.survey.channels[channel].site, model.of(channel)
     signals = [signal_of(effect, site, Part.of(model.survey.config, n)) for n in range(len(parts))]
-
-    def value(filtered: FilteredMaps) -> float:
-        return float(sum(np.dot(filtered.residual[i], signal) for i, signal in zip(parts, signals, strict=True)))
-
-    return value
+    return lambda filtered: sum(_along(i, signal, filtered) for i, signal in zip(parts, signals, strict=True))
 
 
 def differencing_filters(model: Model, effect: Effect, channel: int) -> list[MatchedFilter]:
