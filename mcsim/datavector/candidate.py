@@ -283,9 +283,7 @@ class TemplateBank:
             np.concatenate([self.error, exact], axis=1),
             np.concatenate([self.curvature, exact], axis=1),
             (*self.labels, *labels),
-            np.concatenate([self.slice_matrix, response[size:]], axis=1)
-            if len(self.slice_matrix)
-            else np.zeros((0, 0)),
+            np.concatenate([self.slice_matrix, response[size:]], axis=1),
         )
 
     def _squares(self, spread: Vector) -> tuple[Vector, Vector]:
