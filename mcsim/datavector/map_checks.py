@@ -37,8 +37,8 @@ def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
     lost = float(np.mean(unseen[fiducial]))
     if lost > limits.missing_share:
         raise InputError(
-            f"{name} leaves out {100 * lost:.0f} % of the pixels that the fiducial scan hits, at most "
-            f"{100 * limits.missing_share:.0f} % may be; give the model a mask (map.mask) that leaves them out too."
+            f"{name} leaves out {100 * lost:.3g} % of the pixels that the fiducial scan hits, at most "
+            f"{100 * limits.missing_share:g} % may be; give the model a mask (map.mask) that leaves them out too."
         )
     seen = map_[fiducial & ~unseen]
     zeros = int(np.sum(seen == 0.0))
@@ -54,8 +54,9 @@ def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
     ratio = rms / float(np.sqrt(sky + noise))
     if not 1.0 / limits.rms_ratio < ratio < limits.rms_ratio:
         raise InputError(
-            f"{name} has an rms of {rms:.3g} uK where the model expects {rms / ratio:.3g} uK; is it in another "
-            "unit, or is the dipole still in it? Say the unit in its header (TUNIT1), or give it in uK."
+            f"{name} has an rms of {rms:.3g} uK where the model expects {rms / ratio:.3g} uK, beyond a factor of "
+            f"{limits.rms_ratio:g} either way; is it in another unit, or is the dipole still in it? Say the unit in "
+            "its header (TUNIT1), or give it in uK."
         )
     return map_
 

@@ -168,7 +168,7 @@ def _check_row(path: str | Path, row: Row, pair: Pair, lmax: int, highest: int |
     if not 0 <= low <= high <= lmax:
         raise InputError(
             f"{path}: the bin ell = {low} ... {high} is not within 0 ... {lmax}, the model's analysis; leave the "
-            "row out or raise sky.lmax."
+            "row out or raise biposh.lmax (by default sky.lmax)."
         )
     exists = existing(mode.L, mode.d, lmax if highest is None else min(lmax, highest))[low : high + 1]
     if not exists.any() or (pair.auto and not mode.in_auto):

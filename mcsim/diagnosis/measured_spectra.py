@@ -34,7 +34,8 @@ class MeasuredSpectra(DataSet[Spectra]):
         size = np.abs(value) / np.sqrt(np.mean(context.ensemble.simulations**2, axis=0))
         unit = "is the unit in its header the right one, and the scaling?"
         if power.any() and not 1.0 / limits.cl_ratio < (ratio := np.median(size[power])) < limits.cl_ratio:
-            raise InputError(f"{path}: C_l are {ratio:.2g} times the model's, beyond {limits.cl_ratio:g}; {unit}")
+            factor = f"beyond a factor of {limits.cl_ratio:g} either way"
+            raise InputError(f"{path}: C_l are {ratio:.2g} times the model's, {factor}; {unit}")
         if not power.all() and (ratio := np.median(size[~power])) > limits.biposh_ratio:
             raise InputError(
                 f"{path}: BipoSH are {ratio:.2g} times as large as the simulations', beyond {limits.biposh_ratio:g}; "

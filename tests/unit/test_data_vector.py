@@ -2,18 +2,21 @@
 
 from dataclasses import replace
 
+import healpy
 import numpy as np
 import pytest
 
 from instruments import two_channels
 from mcsim import config
 from mcsim.datavector.analysis import analysis_of
+from mcsim.datavector.map_checks import checked_map
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element, blocks_of, pair_classes, ranges_within
 from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.systematics import catalogue
+from refusals import refused
 
 EDGES = (2, 12, 23, 33, 44, 54, 65)
 
@@ -120,3 +123,12 @@ def test_maps_without_a_pixel_in_common_have_no_noise_of_their_difference(analys
     assert "noise" not in {element.kind for block in blocks for element in block.elements}
     for block in blocks:
         assert np.size(block.values(filtered)) == len(block.elements)
+
+
+@pytest.mark.parametrize(("unseen", "factor", "named"), [(43, 1.0, (1.4, 1)), (0, 100.0, (20, "factor", "TUNIT1"))])
+def test_a_map_that_is_refused_is_told_by_how_much(analysis, unseen, factor, named) -> None:
+    """1.4 % are more than 1 %, and both of a ratio's limits are one number."""
+    map_uk = factor * next(iter(simulate.maps(survey(analysis.run), 0)))
+    map_uk[:unseen] = healpy.UNSEEN
+    with refused("W1", *named):
+        checked_map(analysis.model, analysis.model.parts[0], map_uk, "the map of W1")

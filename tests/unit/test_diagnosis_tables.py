@@ -208,7 +208,7 @@ def test_headers_that_do_not_fit_are_refused(tmp_path, change, named):
 @pytest.mark.parametrize(
     ("column", "value", "named"),
     [
-        ("ell_max", 50, (50, 40, "sky.lmax")),
+        ("ell_max", 50, (50, 40, "biposh.lmax", "sky.lmax")),
         ("M", 3, ("L0M3d0",)),
         ("ell_min", 11, ("twice",)),
         ("value", np.nan, ("L0M0d0", "nan")),
@@ -237,7 +237,7 @@ def test_an_unknown_pair_is_refused(tmp_path):
 def test_numbers_in_another_unit_are_refused(small, tmp_path):
     table = measured(RUN)
     table["value"] *= 1e-6
-    with refused("C_l", "1e-06", 25, "unit"):
+    with refused("C_l", "1e-06", "factor", 25, "unit"):
         judged(small, tmp_path, table)
 
 
