@@ -166,8 +166,7 @@ class Interpolation(Difference):
         key = (*value, pixels.start, pixels.stop, scene.sky.tobytes())
         if key not in self._made:
             grid = looked_up(scene, int(value[0]), bool(value[1]), pixels)
-            change = scene.sampled(pointing, scene.window, grid) - scene.sampled(pointing, scene.window)
-            self._made[key] = np.where(pair.seen, change, 0.0)
+            self._made[key] = scene.sampled(pointing, scene.window, grid) - scene.sampled(pointing, scene.window)
         return self._made[key]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 import mcsim
+from mcsim.comparison import time_differences
 from mcsim.comparison.effects import EffectDifference
 from mcsim.comparison.map_differences import Calibration, Dipole, FrameReversed, Monopole, Unit
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.prediction import Prediction, Set
 from mcsim.comparison.scene_differences import Smoothing, TimeShift
 from mcsim.comparison.search import Problem, _in_turn
+from mcsim.comparison.time_differences import Interpolation
 from mcsim.systematics.registry import catalogue
 
 
@@ -91,3 +93,16 @@ def test_a_pixel_gone_wrong_is_no_unit():
 def test_a_factor_beyond_ten_is_a_unit_and_no_calibration():
     assert Unit().equivalent(np.array([1e-6])) == []
     assert Unit().equivalent(np.array([0.8]))[0][1] == pytest.approx(-0.2)
+
+
+def test_what_a_grid_makes_is_the_same_whatever_side_b_has_observed(monkeypatch):
+    """Pixels that were exchanged afterwards have what it made where they were, and holes may have been elsewhere."""
+    monkeypatch.setattr(time_differences, "looked_up", lambda *_: "a grid")
+    scene = SimpleNamespace(
+        preparations=(), nside=1, sky=np.zeros(1), window=np.ones(1),
+        sampled=lambda pointing, window, signal=None: np.full((1, 12), 3.0 if signal else 1.0),
+    )  # fmt: skip
+    seen, difference = np.arange(12)[None] < 6, Interpolation()
+    for here in (seen, ~seen):
+        pair = SimpleNamespace(scene=scene, pointing=lambda longest: "known", seen=here)
+        np.testing.assert_array_equal(difference._response(np.array([2.0, 1.0]), pair)[here], 2.0)
