@@ -240,8 +240,13 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
             seen = m.moments.hits > 0
             if m.weight is not None:
                 seen = seen & (m.weight > 0)
-            variance = floor**2 + (0.0 if m.noise_uk is None else m.noise_uk**2)
-            precision = np.where(seen, 1.0 / np.broadcast_to(variance, seen.shape), 0.0)
+            variance = np.broadcast_to(floor**2 + (0.0 if m.noise_uk is None else m.noise_uk**2), seen.shape)
+            if np.any(variance[seen] == 0.0):
+                raise InputError(
+                    f"noise_floor = {settings.noise_floor:g}, but map {m.name} has pixels without noise; give more "
+                    "than 0, or the map noise."
+                )
+            precision = np.where(seen, 1.0 / variance, 0.0)
             noise_power = 4 * np.pi / seen.size * float(np.mean(1.0 / precision[seen]))
             parts.append(Part(index, m.name, split, m.moments, precision, noise_power))
     snr = survey.cl * sum(response[part.channel] ** 2 / part.noise_power for part in parts)

@@ -12,7 +12,7 @@ from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.map_checks import checked_map
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element, blocks_of, pair_classes, ranges_within
-from mcsim.datavector.wiener_filter import wiener_filter
+from mcsim.datavector.wiener_filter import model_of, wiener_filter
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.systematics import catalogue
@@ -132,3 +132,11 @@ def test_a_map_that_is_refused_is_told_by_how_much(analysis, unseen, factor, nam
     map_uk[:unseen] = healpy.UNSEEN
     with refused("W1", *named):
         checked_map(analysis.model, analysis.model.parts[0], map_uk, "the map of W1")
+
+
+def test_a_map_without_noise_needs_a_floor_of_it() -> None:
+    run = config.load(two_channels("quiet"))
+    quiet = survey(replace(run, channels=tuple(channel.without_noise() for channel in run.channels)))
+    with refused("noise_floor", 0, quiet.map_names[0]):
+        model_of(quiet, DiagnosisSettings(noise_floor=0.0))
+    model_of(survey(run), DiagnosisSettings(noise_floor=0.0))
