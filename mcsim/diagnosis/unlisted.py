@@ -316,12 +316,12 @@ class Reconstruction:
         if plugins[0] is None:  # the others are what it leaves
             return None
         context, settings = self.data.context, self.data.context.settings
-        splits = [view.split for view in self.scene.views]
+        folds = [view.split % 2 for view in self.scene.views]
         first = []
         for structure, effect in acting:
             by_map = structure.views and not structure.by_coordinate and structure.stage != "noise"
             if by_map and len(self.scene.splits) > 1:
-                if not len((half := structure.within(0, splits)).weights):
+                if not len((half := structure.within(0, folds)).weights):
                     return None
                 ((theta, _),) = self.search.fit([half], self.x)
                 effect = plugin(effect.name, structure, theta, self.scene) or effect

@@ -144,9 +144,9 @@ class Structure:
         found = (scores[..., self.rows] * self.weights).sum(axis=-1)
         return found if self.mix is None else found @ self.mix.T
 
-    def within(self, split: int, splits: Sequence[int]) -> "Structure":
-        """Return the same, measured in the maps of one split; ``splits`` are those of all maps."""
-        kept = [k for k, view in enumerate(self.views) if splits[view] == split]
+    def within(self, fold: int, folds: Sequence[int]) -> "Structure":
+        """Return the same, measured in the maps of one fold; ``folds`` are those of all maps."""
+        kept = [k for k, view in enumerate(self.views) if folds[view] == fold]
         views = tuple(self.views[k] for k in kept)
         return replace(self, rows=self.rows[:, kept], weights=self.weights[kept], views=views)
 

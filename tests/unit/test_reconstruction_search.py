@@ -1,11 +1,13 @@
 """The search of a grammar: what is found in scores, how significant it is, and what chance finds."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from mcsim.diagnosis import unlisted
 from mcsim.reconstruction.grammar import LOWEST
 from mcsim.reconstruction.plugin import CONSTANT
 from mcsim.reconstruction.search import ALTERNATIVES, LEVEL, MOST, RARE, Response, Search, evidence
@@ -249,3 +251,20 @@ def test_evidence_falls_with_the_number_of_coordinates():
     assert evidence(np.array([3.0]), 4)[0] == 0.0
     assert MOST >= 1
     assert ALTERNATIVES > 1.0
+
+
+def test_a_structure_is_fitted_to_all_maps_of_the_first_fold(monkeypatch):
+    """Of three splits the first and the third: the second one judges."""
+    fitted, split = [], [SimpleNamespace(split=number) for number in range(3)]
+    found = Structure(
+        "added", "", "sky", "monopole", "W1", ALIKE, None, np.arange(3)[None], np.ones(3), None, (0, 1, 2)
+    )
+    monkeypatch.setattr(unlisted, "plugin", lambda *_: None)
+    monkeypatch.setattr(unlisted.Halves, "of", lambda *_: None)
+    search = SimpleNamespace(fit=lambda chosen, x: fitted.extend(chosen) or [(np.ones(1), np.eye(1))])
+    context = SimpleNamespace(settings=None, ensemble=SimpleNamespace(remix=lambda matrix: None))
+    data = SimpleNamespace(context=context, halves=lambda: (np.eye(1), "halves"), x=np.zeros(1))
+    scene = SimpleNamespace(views=split, splits=("a", "b", "c"))
+    made = unlisted.Reconstruction(data, data, scene, search, np.zeros(3), None)
+    assert made.reduction([found], [SimpleNamespace(name="unlisted_1")]) is None
+    assert [one.views for one in fitted] == [(0, 2)]
