@@ -157,7 +157,7 @@ def calibrate(
             smallest[row] = np.minimum(smallest[row], nested_pvalue(delta_chi2, total, k, p, n))
     first = Calibration(int((sizes > 0).sum()), np.sort(smallest.ravel()), np.empty(0))
     least = np.minimum(omnibus.ravel(), first.global_pvalue(smallest.ravel()))
-    return Calibration(first.tests, first.smallest, np.sort(least))
+    return replace(first, combined=np.sort(least))
 
 
 @dataclass(frozen=True)
@@ -180,9 +180,8 @@ def global_test(
     """Test data, shape (p_raw,), with chi^2 and with every candidate, and combine both into one p-value."""
     y = null.whiten(x)
     chi2 = float(y @ y)
-    omnibus = null.pvalue(x)
     scores = null.nested_test(candidates.delta_chi2(y), chi2, candidates.sizes)
-    best = int(np.argmin(scores))
+    best, omnibus = int(np.argmin(scores)), float(null.residual_test(chi2))
     return GlobalTest(
         pvalue=float(calibration.combine(omnibus, scores[best])),
         chi2=chi2,
