@@ -230,8 +230,7 @@ class Slices:
         """Return the comparison of a division's parts; None if the effect does not show in two of them."""
         response = action.response
         division = self._clear(division, response, action.growth > 1.0)
-        null = self.null(division.rows)
-        if null is None or len(division.keep) < 2:
+        if len(division.keep) < 2 or (null := self.null(division.rows)) is None:
             return None
         rows = division.rows
         x, beside, count = self.z[rows], others[rows], others.shape[1]
