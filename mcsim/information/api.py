@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -263,11 +263,14 @@ def _candidates(
             raise InputError(f"nuisance {name!r} is no effect of this model; choose from {', '.join(sorted(known))}.")
         if not 0.0 < width < np.inf:
             raise InputError(f"nuisance {name} has a width of {width:g}; give the width of its prior, above 0.")
-    wanted = [
-        candidate
-        for candidate in analysis.candidates
-        if not settings.only or candidate.name in settings.only or _is_nuisance(candidate, settings)
-    ]
+    priors: dict[tuple[str, str | None], list[Candidate]] = {}
+    wanted = []
+    for candidate in analysis.candidates:
+        if _is_nuisance(candidate, settings):
+            priors.setdefault(candidate.identity, []).append(candidate)
+        elif not settings.only or candidate.name in settings.only:
+            wanted.append(candidate)
+    wanted += map(_of_prior, priors.values())
     for candidate in wanted:
         fit = candidate.parametrization
         if fit.stochastic and fit.mean_response and fit.sign >= 0:
@@ -281,7 +284,15 @@ def _candidates(
             "nuisance, or this model lacks what it acts on, such as the times of a scan; ask for one of "
             f"{', '.join(sorted({candidate.name for candidate in analysis.candidates}))}."
         )
-    return analysis, numbered([replace(candidate) for candidate in wanted])
+    return analysis, numbered(wanted)
+
+
+def _of_prior(variants: Sequence[Candidate]) -> Candidate:
+    """Return a nuisance in the coordinates of its prior: with the effect's own parameters, none of them fitted."""
+    usual = vars(variants[0].effect()).items()
+    own = next((one for one in variants if one.settings.items() <= usual), variants[0])
+    columns = tuple(range(len(own.effect.parametrization.basis())))
+    return replace(own, columns=columns, fit=None)
 
 
 def _is_nuisance(candidate: Candidate, settings: LimitSettings) -> bool:

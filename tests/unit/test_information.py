@@ -383,6 +383,31 @@ def test_effects_and_nuisances_of_the_run_stay_in_their_channel() -> None:
         mcsim.limit(model(nuisance=[several]))
 
 
+@pytest.mark.parametrize(
+    ("nuisance", "where", "target", "rows"),
+    [("foreground_residual", None, "monopole_residual", [0]), ("beam_sidelobe", "Q1", "calibration", [0, 1])],
+)
+def test_nuisance_has_its_prior_in_its_own_coordinates(
+    nuisance: str, where: str | None, target: str, rows: list[int]
+) -> None:
+    """At its own index and calibration: a sidelobe of unknown calibration made sigma of the gain 100 times as large."""
+    channels = [
+        channel(name, "A", (1150.0, 900.0), 200.0) | {"frequency_ghz": ghz}
+        for name, ghz in (("Q1", 41.0), ("V1", 61.0), ("W1", 94.0))
+    ]
+    run = model(map={"nside": NSIDE}, channel=channels)
+    declared = replace(run, nuisances=(config.Nuisance(effect=nuisance, width=(2.0,), channel=where),))
+    every, found = (
+        mcsim.limit(each, settings=mcsim.LimitSettings(only=only, dense=True))
+        for each, only in ((run, (target, nuisance)), (declared, (target,)))
+    )
+    own = np.flatnonzero([name.startswith(f"{nuisance} ({where or 'all'}") for name in every.components])[rows]
+    kept = np.flatnonzero([name.startswith(target) for name in every.components])
+    both = every.fisher[np.ix_([*kept, *own], [*kept, *own])]
+    expected = marginalised(both, range(len(kept), len(both)), [2.0] * len(own))
+    np.testing.assert_allclose(found.fisher, expected, atol=1e-7 * expected.max())
+
+
 def test_noise_that_is_not_white_is_refused() -> None:
     noise = {"kind": "correlated", "sigma0_uk": 200.0, "f_knee_hz": 1e-5, "f_min_hz": 1e-7, "alpha": 1.0}
     with refused("V1:half1", "V1", "white"):
