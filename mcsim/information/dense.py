@@ -93,4 +93,4 @@ def dense(filtered: InverseCovariance, derivatives: Sequence[Derivative], cl: Cl
         columns = np.stack([mean[half] for mean in means], axis=1)
         others = np.stack([mean[1 - half] for mean in means], axis=1)
         found += 0.5 * columns.T @ cho_solve(factor, others)
-    return Information((found + found.T) / 2.0, np.zeros(K))
+    return Information((found + found.T) / 2.0)

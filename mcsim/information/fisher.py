@@ -35,10 +35,11 @@ TOGETHER = 16
 
 @dataclass(frozen=True)
 class Information:
-    """Hold a Fisher matrix, shape (K, K), per unit of each coordinate, and the relative error of its diagonal, (K,)."""
+    """Hold a Fisher matrix, shape (K, K), per unit of each coordinate, and what tells its error."""
 
     fisher: Matrix
-    error: NDArray[np.float64]
+    #: for each group of n probes the matrix without one of them, shape (n, K, K); empty: there are no probes
+    left_out: tuple[NDArray[np.float64], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -64,11 +65,11 @@ def stochastic(
 
     Notes
     -----
-    The relative error of the diagonal is by jackknife over the probes; it is about 2/number.
+    The relative error of the diagonal, by jackknife over the probes, is about 2/number.
     """
     K, group, done = len(derivatives), group_of(probes, filtered), 0.0
     found: list[Matrix] = []
-    variance = []
+    left_out = []
     for first in range(0, probes.number, group):
         members = range(first, min(first + group, probes.number))
         if len(members) < 3 and found:
@@ -85,14 +86,14 @@ def stochastic(
                 done += len(responses)
                 report(done)
         both = (table + np.swapaxes(table, 1, 2)) * (1.0 - np.eye(len(members)))
-        flat = both.reshape(K, -1)
-        found.append(0.5 * flat @ flat.T / (len(members) * (len(members) - 1)))
-        variance.append(_left_out(0.5 * both**2))
+        each = 0.5 * np.swapaxes(both, 0, 1) @ np.moveaxis(both, 0, 2)  # of the pairs of each probe
+        whole, n = each.sum(axis=0), len(members)
+        found.append(whole / (n * (n - 1)))
+        left_out.append((whole - 2.0 * each) / ((n - 1) * (n - 2)) - found[-1])
     first_half, second_half = zip(*(derivative.mean for derivative in derivatives), strict=True)
     total = np.mean(found, axis=0) + _filtered_products(filtered, derivatives, first_half, second_half)
-    size = np.diag(total)
-    error = np.sqrt(np.mean(variance, axis=0) / len(variance))
-    return Information((total + total.T) / 2.0, divided(error, size))
+    total = (total + total.T) / 2.0
+    return Information(total, tuple(total + change / len(found) for change in left_out))
 
 
 def _draw(filtered: InverseCovariance, cl: Cl, seed: int, number: int, x: Maps) -> Alm:
@@ -130,11 +131,3 @@ def _filtered_products(
                 found[i, j] = np.sum(a * filtered.precision[low:high] * b)
             found[i, j] -= product(seen[i], sky, filtered.lmax)
     return found
-
-
-def _left_out(products: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the jackknife variance of the mean over pairs of different probes, symmetric (K, n, n) to (K,)."""
-    n = products.shape[1]
-    each = products.sum(axis=2)
-    without = (each.sum(axis=1)[:, None] - 2.0 * each) / ((n - 1) * (n - 2))
-    return np.asarray((n - 1) * without.var(axis=1))

@@ -14,7 +14,7 @@ from mcsim.ensemble.store import write_dataset
 from mcsim.information.fisher import Information
 from mcsim.information.settings import LimitSettings
 from mcsim.stats.detection import snr_needed, snr_to_separate
-from mcsim.support.arrays import Matrix, texts
+from mcsim.support.arrays import Matrix, Vector, divided, texts
 from mcsim.support.folders import unwritable, write_whole
 from mcsim.support.numbers import number
 
@@ -245,19 +245,20 @@ def limits_of(
     widths = [float(width[k] or 0.0) for k in known for _ in candidates[k].columns]
     fisher = marginalised(information.fisher, rows, widths)
     rest = [candidate for candidate, one in zip(candidates, width, strict=True) if one is None]
-    error = np.delete(information.error, rows)
     left = numbered(rest)
     correlation = canonical_correlations(fisher, [candidate.columns for candidate in left])
+    sizes = _sizes(left, fisher)
+    errors = np.zeros(len(left))
+    for group in information.left_out:
+        without = [_sizes(left, marginalised(matrix, rows, widths)) for matrix in group]
+        errors += (len(group) - 1.0) * np.var(without, axis=0)
+    errors = 0.5 * divided(np.sqrt(errors), sizes)
     found = []
     for index, candidate in enumerate(left):
         own = list(candidate.columns)
         values = np.linalg.eigvalsh(fisher[np.ix_(own, own)])
         rank = max(int(np.sum(values > RESOLVED * values[-1])), 1)
-        typical = candidate.typical
-        size = max(float(np.einsum("kj,kl,lj", typical, fisher[np.ix_(own, own)], typical)) / typical.shape[1], 0.0)
-        sigma = 1.0 / np.sqrt(size) if size > 0.0 else np.inf
-        weight = np.mean(typical**2, axis=1)
-        share = weight * np.diag(fisher)[own] / max(size, 1e-300)
+        sigma = 1.0 / np.sqrt(sizes[index]) if sizes[index] > 0.0 else np.inf
         others = np.where([one.identity == candidate.identity for one in left], -1.0, correlation[index])
         similar = int(np.argmax(others)) if np.any(others > 0.0) else None
         rho = 0.0 if similar is None else float(correlation[index, similar])
@@ -270,7 +271,7 @@ def limits_of(
                 candidate.title,
                 len(own),
                 sigma,
-                float(0.5 * np.sqrt(np.sum((share * error[own]) ** 2))),
+                float(errors[index]),
                 sigma * snr_needed(rank, 1, rank, None, settings.alpha, settings.power),
                 sigma * snr_needed(rank, tests, rank, None, settings.alpha, settings.power),
                 similar,
@@ -280,6 +281,15 @@ def limits_of(
         )
     names = tuple(f"{one.label}/{k}" for one in left for k in range(len(one.columns)))
     return Limits(model, tuple(found), correlation, fisher, names, tests, method, settings)
+
+
+def _sizes(candidates: Sequence[Candidate], fisher: Matrix) -> Vector:
+    """Return the information of each effect at unit amplitude, the mean over its directions, shape (candidates,)."""
+    found = []
+    for candidate in candidates:
+        typical, own = candidate.typical, fisher[np.ix_(candidate.columns, candidate.columns)]
+        found.append(max(float(np.einsum("kj,kl,lj", typical, own, typical)) / typical.shape[1], 0.0))
+    return np.array(found)
 
 
 def _width(candidate: Candidate, settings: LimitSettings) -> float | None:
