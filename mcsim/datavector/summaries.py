@@ -286,7 +286,7 @@ def _contrast_blocks(model: Model) -> list[Block]:
         return []
     groups = [[c for c, f in enumerate(frequencies) if f == end] for end in (known[0], known[-1])]
     top = min(model.settings.large_scales, model.lmax)
-    nside = max(1, 1 << (top // 3).bit_length() - 1) * 2
+    nside = 2 << max(top // 3, 1).bit_length() - 1
     ranges = list(pairwise(model.settings.latitude_edges))
     height = np.abs(sine_of_latitude(model.frame, "galactic", nside))
     bands = np.stack([(height >= low) & (height <= high) for low, high in ranges]).astype(float)

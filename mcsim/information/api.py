@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mcsim import config, systematics
-from mcsim.datavector.analysis import Analysis, analysis_of
+from mcsim.datavector.analysis import Analysis, analysis_of, check_asked
 from mcsim.datavector.candidate import Candidate, numbered
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
@@ -284,6 +284,7 @@ def _candidates(
             "nuisance, or this model lacks what it acts on, such as the times of a scan; ask for one of "
             f"{', '.join(sorted({candidate.name for candidate in analysis.candidates}))}."
         )
+    check_asked(analysis, [name for name in settings.only if name not in settings.without])
     return analysis, numbered(wanted)
 
 

@@ -30,9 +30,9 @@ class LimitSettings:
         model's spectrum says all of the sky. A model without power there knows them, but for noise, and so knows what
         modulations make of a quadrupole.
     alpha, power
-        Global level of the test, and its power at the amplitudes that are called detected.
+        Global level of the test, and its power, above it, at the amplitudes that are called detected.
     separation
-        Probability that the right one of two effects is chosen at the amplitude at which they are told apart.
+        Probability, above a half, that the right one of two effects is chosen where they are called told apart.
     orders
         Highest azimuthal order of the fiducial beams in the inverse covariance, the centroids of the samples included;
         0: circular beams at pixel centres. What an effect changes has all orders in any case.
@@ -69,7 +69,7 @@ class LimitSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raise InputError for settings of another kind, negative numbers, and levels outside 0 to 1."""
+        """Raise InputError for settings of another kind, negative numbers, and levels that mean nothing."""
         check_settings(self)
         if not isinstance(self.nuisances, Mapping):
             raise InputError(f"nuisances = {self.nuisances!r} is no dict; give widths, as {{'calibration': 0.01}}.")
@@ -78,3 +78,12 @@ class LimitSettings:
         for name in ("alpha", "power", "separation"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise InputError(f"{name} = {getattr(self, name):g} is no probability; give one between 0 and 1.")
+        if self.power <= self.alpha:
+            raise InputError(
+                f"power = {self.power:g} is not above alpha = {self.alpha:g}, which maps without any effect reach; "
+                "raise power, or lower alpha."
+            )
+        if self.separation <= 0.5:
+            raise InputError(
+                f"separation = {self.separation:g} is no more than a guess of one out of two has; give one above 0.5."
+            )

@@ -477,3 +477,24 @@ def test_bad_input_is_refused() -> None:
         mcsim.limit(model(), settings=mcsim.LimitSettings(nuisances={"beam_width": 0.0}))
     with refused("probes", 2):
         mcsim.limit(model(), settings=mcsim.LimitSettings(probes=2))
+    with refused("power", 0.05, "alpha"):
+        mcsim.LimitSettings(power=0.05)
+    with refused("separation", 0.5):
+        mcsim.LimitSettings(separation=0.5)
+
+
+def test_an_effect_that_cannot_act_is_named_beside_one_that_can() -> None:
+    """It was left out without a word."""
+    still = model(sky={"spectrum": "wmap7", "lmax": LMAX})
+    with refused("nonlinearity", "sky.dipole_uk"):
+        mcsim.limit(still, settings=mcsim.LimitSettings(only=("noise_level", "nonlinearity")))
+
+
+def test_two_frequencies_of_two_degrees_have_limits() -> None:
+    """Their contrast by latitude ended in "negative shift count"."""
+    two = [channel("V1", "A", (1150.0, 900.0), 200.0), channel("W1", "A", (1150.0, 900.0), 200.0)]
+    run = model(sky={"spectrum": "wmap7", "lmax": 2}, channel=[two[0], two[1] | {"frequency_ghz": 61.0}])
+    found = mcsim.limit(run, settings=mcsim.LimitSettings(only=("noise_level",), dense=True))
+    pixels = sum(np.sum(m.weight > 0.0) for m in survey(run).channels[0].maps)
+    # The sky hides five modes of each half at most.
+    assert 1.0 / np.sqrt(2.0 * pixels) < found.effects[0].sigma < 1.0 / np.sqrt(2.0 * (pixels - 2 * 5))
