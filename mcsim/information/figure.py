@@ -28,11 +28,11 @@ def limit_figure(found: Limits) -> Figure:
     ):
         ratio = [getattr(one, key) / one.sigma if np.isfinite(one.sigma) else 0.0 for one in effects]
         left.barh(rows, ratio, height=0.72, color=colour, label=text)
-    apart = np.array([one.separable / one.sigma if np.isfinite(one.separable) else np.inf for one in effects])
-    inside = apart < REACH
+    apart = np.array([np.inf if np.isinf(one.separable) else one.separable / one.sigma for one in effects])
+    inside, beyond = apart < REACH, apart >= REACH  # neither without another effect
     style: dict[str, Any] = {"markersize": 9, "markeredgewidth": 1.6, "linestyle": "none", "color": "black"}
     left.plot(apart[inside], rows[inside], marker="|", label="told apart from the most similar", **style)
-    left.plot([0.97 * REACH] * int(np.sum(~inside)), rows[~inside], marker="$>$", label="beyond", **style)
+    left.plot([0.97 * REACH] * int(np.sum(beyond)), rows[beyond], marker="$>$", label="beyond", **style)
     for row, one in enumerate(effects):
         unit = "" if one.unit.startswith("1") else f" ({one.unit})"
         shown = f"{number(one.sigma)} | {number(one.amplitude_90)}{unit}"

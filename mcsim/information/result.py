@@ -43,7 +43,7 @@ class EffectLimit:
     similar, correlation
         Index of the other effect with the most similar response, None without one, and their canonical correlation.
     separable
-        Amplitude at which the right one of the two is chosen with the probability asked for.
+        Amplitude at which the right one of the two is chosen with the probability asked for; NaN without another one.
     """
 
     name: str
@@ -262,6 +262,7 @@ def limits_of(
         others = np.where([one.identity == candidate.identity for one in left], -1.0, correlation[index])
         similar = int(np.argmax(others)) if np.any(others > 0.0) else None
         rho = 0.0 if similar is None else float(correlation[index, similar])
+        apart = np.nan if similar is None else float(snr_to_separate(rho, settings.separation))
         found.append(
             EffectLimit(
                 *candidate.identity,
@@ -276,7 +277,7 @@ def limits_of(
                 sigma * snr_needed(rank, tests, rank, None, settings.alpha, settings.power),
                 similar,
                 rho,
-                sigma * float(snr_to_separate(rho, settings.separation)),
+                sigma * apart,
             )
         )
     names = tuple(f"{one.label}/{k}" for one in left for k in range(len(one.columns)))

@@ -314,6 +314,7 @@ def test_additive_effect_has_its_signal_to_noise() -> None:
     assert found.fisher[2, 2] == pytest.approx(np.sum(signal**2) / 300.0**2, rel=1e-3)
     np.testing.assert_allclose(found.fisher, found.fisher[2, 2] * np.eye(3), atol=1e-3 * found.fisher[2, 2])
     assert found.effects[0].sigma == pytest.approx(1.0 / np.sqrt(found.fisher[2, 2]), rel=1e-3)
+    assert found.to_json()["effects"][0]["separable"] is None  # there is no other effect
 
 
 @pytest.mark.slow
@@ -477,10 +478,9 @@ def test_bad_input_is_refused() -> None:
         mcsim.limit(model(), settings=mcsim.LimitSettings(nuisances={"beam_width": 0.0}))
     with refused("probes", 2):
         mcsim.limit(model(), settings=mcsim.LimitSettings(probes=2))
-    with refused("power", 0.05, "alpha"):
-        mcsim.LimitSettings(power=0.05)
-    with refused("separation", 0.5):
-        mcsim.LimitSettings(separation=0.5)
+    for name in ("power", "separation"):
+        with refused(name, 0.05):
+            mcsim.LimitSettings(**{name: 0.05})
 
 
 def test_an_effect_that_cannot_act_is_named_beside_one_that_can() -> None:
