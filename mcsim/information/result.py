@@ -109,7 +109,11 @@ class Limits:
     @property
     def unknowns(self) -> str:
         """Say what is marginalised; empty: nothing."""
-        known = [f"{name} ± {width:g}" for name, width in self.settings.nuisances.items()]
+        known = []
+        for name, width in self.settings.nuisances.items():
+            kind = (self.settings.library or {}).get(name.partition(":")[0])
+            drawn = kind is not None and kind.parametrization.stochastic and kind.parametrization.sign == 0
+            known.append(f"{name} ± {width:g}" + (" (its mean shape alone)" if drawn else ""))
         if self.settings.unknown_dipole_uk:
             known.append(f"a monopole and dipole of {self.settings.unknown_dipole_uk:g} µK rms")
         return f"Marginalised over {', '.join(known)}." if known else ""

@@ -401,9 +401,7 @@ def test_effects_and_nuisances_of_the_run_stay_in_their_channel() -> None:
     ("nuisance", "where", "target", "rows"),
     [("foreground_residual", None, "monopole_residual", [0]), ("beam_sidelobe", "Q1", "calibration", [0, 1])],
 )
-def test_nuisance_has_its_prior_in_its_own_coordinates(
-    nuisance: str, where: str | None, target: str, rows: list[int]
-) -> None:
+def test_nuisance_has_its_own_coordinates(nuisance: str, where: str | None, target: str, rows: list[int]) -> None:
     """At its own index and calibration: a sidelobe of unknown calibration made sigma of the gain 100 times as large."""
     channels = [
         channel(name, "A", (1150.0, 900.0), 200.0) | {"frequency_ghz": ghz}
@@ -415,11 +413,12 @@ def test_nuisance_has_its_prior_in_its_own_coordinates(
         mcsim.limit(each, settings=mcsim.LimitSettings(only=only, dense=True))
         for each, only in ((run, (target, nuisance)), (declared, (target,)))
     )
-    own = np.flatnonzero([name.startswith(f"{nuisance} ({where or 'all'}") for name in every.components])[rows]
-    kept = np.flatnonzero([name.startswith(target) for name in every.components])
-    both = every.fisher[np.ix_([*kept, *own], [*kept, *own])]
-    expected = marginalised(both, range(len(kept), len(both)), [2.0] * len(own))
+    names, head = every.components, f"{nuisance} ({where or 'all'}"
+    kept, own = (np.flatnonzero([name.startswith(one) for name in names]) for one in (target, head))
+    both = every.fisher[np.ix_([*kept, *own[rows]], [*kept, *own[rows]])]
+    expected = marginalised(both, range(len(kept), len(both)), [2.0] * len(rows))
     np.testing.assert_allclose(found.fisher, expected, atol=1e-7 * expected.max())
+    assert ("mean shape" in found.unknowns) == (nuisance == "foreground_residual")
 
 
 def test_noise_that_is_not_white_is_refused() -> None:
