@@ -216,7 +216,7 @@ def _with_declared(run: config.RunConfig, settings: LimitSettings) -> tuple[conf
                 f"nuisance {name} of the run has parameters, or several widths, and a limit knows one width for an "
                 f"effect; leave the table out, and give --nuisance {name}={max(one.widths):g}."
             )
-        found[name] = one.widths[0]
+        found[name] = float(one.sigma[0])
     for text, width in settings.nuisances.items():
         name, colon, channel = text.partition(":")
         if name.endswith(".py"):
