@@ -4,6 +4,7 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from importlib import import_module
@@ -44,9 +45,10 @@ class Code(Source):
         return hash_of(self.content, self.effects, self.takes_sky)
 
     def _given(self, seed: int, realization: int, effects: Sequence[config.Effect], sky: Alm | None) -> Any:
-        own: dict[str, Any] = {"effects": tuple(effects)} if effects else {}
+        # A simulator may change what it is given, in place: the next realization is given the same.
+        own: dict[str, Any] = {"effects": deepcopy(tuple(effects))} if effects else {}
         if sky is not None:
-            own["sky"] = sky
+            own["sky"] = sky.copy()
         try:
             return _method(_loaded(self.made))(seed_of(seed, realization), **own)
         except InputError:

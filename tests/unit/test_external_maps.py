@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from mcsim import config
+from mcsim.ensemble.external import source_of
 from mcsim.ensemble.external_maps import Part, fits_maps, in_order
 from refusals import refused
 
@@ -53,3 +55,18 @@ def test_maps_of_another_frame_or_order_are_refused() -> None:
     ]:
         with refused(*named):
             in_order({"V": map_.assign_attrs({attribute: value})}, PARTS, "run.zarr")
+
+
+def test_a_simulator_that_works_in_place_is_given_the_same_sky_and_effects_again() -> None:
+    """With a sky that was smoothed once more for each call, a modulation of 0.2 was no longer found."""
+
+    def simulate(seed, effects=(), sky=None):
+        sky *= 2.0
+        for one in effects:
+            sky *= 1.0 + one.parameters.pop("amplitude", 0.0)
+        return {"demo": np.full(12, sky[0].real)}
+
+    source = source_of(config.load("tiny"), simulate)
+    sky, effects = np.ones(6, dtype=complex), (config.Effect(name="calibration", parameters={"amplitude": 0.5}),)
+    for realization in range(2):
+        np.testing.assert_array_equal(source.maps(0, realization, effects, sky), [np.full(12, 3.0)])
