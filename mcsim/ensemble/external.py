@@ -3,14 +3,15 @@
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import chdir
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cloudpickle
 import numpy as np
@@ -50,7 +51,7 @@ class Code(Source):
         if sky is not None:
             own["sky"] = sky.copy()
         try:
-            return _method(_loaded(self.made))(seed_of(seed, realization), **own)
+            return _loaded(self.made)(seed_of(seed, realization), **own)
         except InputError:
             raise
         except (Exception, SystemExit) as error:  # whatever a foreign program does
@@ -120,7 +121,7 @@ def _code(parts: tuple[Part, ...], label: str, made: bytes, given: Any) -> Code:
     ``given`` is told from others by its source, and not the copy that ``made`` returns, which has none in a script;
     None: that copy is from a module.
     """
-    simulator = _loaded(made)
+    simulator = _loaded(made).simulator
     method, effects = _method(simulator), getattr(simulator, "effects", None) or ()
     listed = isinstance(effects, Iterable) and not isinstance(effects, str)
     if not listed or not all(isinstance(name, str) for name in effects):
@@ -153,11 +154,25 @@ def _read(path: str) -> Any:
     return cloudpickle.loads(Path(path).read_bytes())()
 
 
+class _Made(NamedTuple):
+    """A simulator, with the working folder and the treatment of numerical errors that it chose when it was made."""
+
+    simulator: Any
+    folder: str
+    errors: Mapping[str, Any]  # of numpy.errstate
+
+    def __call__(self, seed: int, **own: Any) -> Any:
+        """Return what it simulates; folder and errors of this process stay its own."""
+        with chdir(self.folder), np.errstate(**self.errors):
+            return _method(self.simulator)(seed, **own)
+
+
 @lru_cache(maxsize=2)
-def _loaded(made: bytes) -> Any:
+def _loaded(made: bytes) -> _Made:
     """Make a simulator once per process: what it keeps serves all its realizations."""
     try:
-        return cloudpickle.loads(made)()
+        with chdir("."), np.errstate():
+            return _Made(cloudpickle.loads(made)(), os.getcwd(), np.geterr())
     except ImportError as error:  # of an object from a module that this process does not find
         raise InputError(f"a worker cannot load the simulator ({error}); install its module.") from error
 

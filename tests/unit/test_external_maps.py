@@ -1,5 +1,6 @@
 """Stored maps of another program: which files a template names, and what their attributes say."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -70,3 +71,34 @@ def test_a_simulator_that_works_in_place_is_given_the_same_sky_and_effects_again
     sky, effects = np.ones(6, dtype=complex), (config.Effect(name="calibration", parameters={"amplitude": 0.5}),)
     for realization in range(2):
         np.testing.assert_array_equal(source.maps(0, realization, effects, sky), [np.full(12, 3.0)])
+
+
+class Wanders:
+    """A simulator that works in its own folder, and has numpy raise errors."""
+
+    def __init__(self, run):
+        os.chdir(run.channels[0].name)
+        np.seterr(all="raise")
+
+    def simulate(self, seed):
+        values = np.loadtxt("own.txt")
+        with pytest.raises(FloatingPointError):
+            values / 0.0
+        os.chdir("..")
+        np.seterr(all="call")
+        return {"demo": values}
+
+
+def test_folder_and_numerical_errors_of_a_simulator_are_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where its class went to another folder, data were looked for and results written there."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "demo").mkdir()
+    np.savetxt(tmp_path / "demo" / "own.txt", np.arange(12.0))
+    errors = np.geterr()
+    source = source_of(config.load("tiny"), Wanders)
+    for realization in range(2):
+        np.testing.assert_array_equal(source.maps(0, realization), [np.arange(12.0)])
+    assert Path.cwd() == tmp_path
+    assert np.geterr() == errors
