@@ -11,7 +11,7 @@ from mcsim import config, systematics
 from mcsim.datavector import slices as slices_
 from mcsim.datavector.bipolar_scan import BipolarScan, coarse_residuals
 from mcsim.datavector.candidate import Candidate, numbered
-from mcsim.datavector.map_checks import checked_map
+from mcsim.datavector.map_checks import check_differ, checked_map
 from mcsim.datavector.matched_filters import differencing_filters, matched_filter
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Block, Element, blocks_of, of_map
@@ -340,9 +340,11 @@ def external_maps(job: Job, realization: int, sky: Alm | None = None) -> list[Ma
     assert job.source is not None
     seed, added = _seed_and_added(job.simulated, job.fiducial)
     model, where = _analysis(*job.definition).model, job.source.words(seed, realization)
-    maps = job.source.maps(seed, realization, added, sky)
-    named = zip(model.parts, maps, strict=True)
-    return [checked_map(model, part, map_uk, f"the map {part.name} of {where}") for part, map_uk in named]
+    names = [f"the map {part.name} of {where}" for part in model.parts]
+    given = zip(model.parts, job.source.maps(seed, realization, added, sky), names, strict=True)
+    maps = [checked_map(model, part, map_uk, name) for part, map_uk, name in given]
+    check_differ(model, maps, names)
+    return maps
 
 
 @lru_cache(maxsize=2)

@@ -76,7 +76,7 @@ def read_maps(model: Model, folder: str | Path) -> list[Map]:
         raise InputError(f"{folder} is no folder; give one with the observed maps, {first} and so on.")
     maps = [_read(model, part, folder / names[part.name]) for part in model.parts]
     _warn_of_others(path.name for path in folder.glob("*.fits*") if path.name not in names.values())
-    _check_differ(model, maps, [str(folder / names[part.name]) for part in model.parts])
+    check_differ(model, maps, [str(folder / names[part.name]) for part in model.parts])
     return maps
 
 
@@ -112,7 +112,7 @@ def checked(model: Model, maps: Sequence[Map] | Mapping[str, Map]) -> list[Map]:
     for (part, name), map_ in zip(named, maps, strict=True):
         frequency_ghz = model.survey.channels[part.channel].site.frequency_ghz
         found.append(checked_map(model, part, in_uk(map_, name, model.frame, frequency_ghz), name))
-    _check_differ(model, found, [name for _, name in named])
+    check_differ(model, found, [name for _, name in named])
     return found
 
 
@@ -127,7 +127,7 @@ def _warn_of_others(names: Iterable[str]) -> None:
         )
 
 
-def _check_differ(model: Model, maps: Sequence[Map], names: Sequence[str]) -> None:
+def check_differ(model: Model, maps: Sequence[Map], names: Sequence[str]) -> None:
     """Raise InputError for two maps that are the same although both have noise of their own: one is a copy."""
     noisy = [m.noise_uk is not None for channel in model.survey.channels for m in channel.maps]
     for (one, name), (other, copied) in combinations(compress(zip(maps, names, strict=True), noisy), 2):

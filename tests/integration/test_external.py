@@ -352,9 +352,10 @@ def changed(how):
             lambda maps: {name: np.random.default_rng().normal(scale=90.0, size=3072) for name in maps},
             ("simulate", "again"),
         ),
-        (lambda maps: dict.fromkeys(maps, arrays_of(Plain().simulate(1))[0]), ("simulate", "every")),
+        (lambda maps: dict(zip(maps, arrays_of(Plain().simulate(1)), strict=True)), ("simulate", "every")),
+        (lambda maps: maps | {"V:b": maps["V:a"]}, ("simulate", "V:b", "V:a", "same")),
     ],
-    ids=["missing", "nan", "nside", "unit", "text", "other", "same"],
+    ids=["missing", "nan", "nside", "unit", "text", "other", "every", "same"],
 )
 def test_what_a_simulator_cannot_return(how, words):
     with refused(*words):
