@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from mcsim.ensemble.store import refuse_unwritable
-from mcsim.errors import InputError
+from mcsim.errors import InputError, RunError
 
 
 @contextmanager
@@ -22,7 +22,7 @@ def locked(path: Path) -> Iterator[None]:
 
     The lock of a dead process of this host is taken over.
     """
-    lock = path.absolute().with_name(f"{path.name}.lock")
+    lock = _lock_of(path)
     with ExitStack() as stack:
         with refuse_unwritable(path):
             lock.parent.mkdir(parents=True, exist_ok=True)
@@ -30,7 +30,7 @@ def locked(path: Path) -> Iterator[None]:
             descriptor, scratch = tempfile.mkstemp(prefix=f".{path.name}.", dir=lock.parent)
             try:
                 with os.fdopen(descriptor, "wb", buffering=0) as stream:
-                    stream.write(f"{socket.gethostname()} {os.getpid()}".encode())
+                    stream.write(holder().encode())
                 held = stack.enter_context(Path(scratch).open())
                 with suppress(OSError):  # the kernel's lock tells other runs of this process; some disks have none
                     fcntl.flock(held, fcntl.LOCK_EX)
@@ -43,6 +43,27 @@ def locked(path: Path) -> Iterator[None]:
         finally:
             with suppress(OSError):  # if the disk has become read-only, the next run takes the lock over
                 lock.unlink()
+
+
+def holder() -> str:
+    """Return what the lock of a store that this process holds says: host and process."""
+    return f"{socket.gethostname()} {os.getpid()}"
+
+
+def check_held(path: Path, by: str) -> None:
+    """Raise RunError on a worker that does not see the lock of the driver (:func:`holder`): its disk is another one."""
+    found = ""
+    with suppress(OSError):
+        found = _lock_of(path).read_text()
+    if found != by:
+        raise RunError(
+            f"A worker on {socket.gethostname()} does not see the driver's store {path}; choose with -o a folder that "
+            "driver and workers share."
+        )
+
+
+def _lock_of(path: Path) -> Path:
+    return path.absolute().with_name(f"{path.name}.lock")
 
 
 def _linked(scratch: str, lock: Path) -> bool:
@@ -66,8 +87,8 @@ def _remove_if_dead(lock: Path, path: Path) -> None:
                 if os.fstat(stream.fileno()).st_ino == lock.stat().st_ino:
                     lock.unlink()
                 return
-        holder = f"process {process} on {host}" if process else "process 0 on an unknown host"
-        raise InputError(f"Another run writes to {path} ({holder}); wait for it, or remove {lock} if it is gone.")
+        who = f"process {process} on {host}" if process else "process 0 on an unknown host"
+        raise InputError(f"Another run writes to {path} ({who}); wait for it, or remove {lock} if it is gone.")
 
 
 def _alive(process: int) -> bool:

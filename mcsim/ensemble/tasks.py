@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.ensemble import store, summary
 from mcsim.ensemble.layout import Layout
+from mcsim.ensemble.lock import check_held
 from mcsim.errors import InputError, RunError
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import Survey, survey
@@ -37,7 +38,8 @@ class Job:
     """Parameters shared by all tasks of a run; each task carries them, so they are small.
 
     ``text`` is the configuration as JSON, ``digest`` the hash of it and of its files, ``path`` the store, ``chunk`` the
-    number of realizations per task; wanted are ``first`` to ``stop - 1``; ``packages`` are the versions of the driver.
+    number of realizations per task; wanted are ``first`` to ``stop - 1``; ``packages`` are the versions of the driver,
+    ``holder`` is what its lock of the store says, "" without one.
     """
 
     text: str
@@ -47,6 +49,7 @@ class Job:
     first: int
     stop: int
     packages: tuple[tuple[str, str], ...]
+    holder: str = ""
 
 
 def packages() -> tuple[tuple[str, str], ...]:
@@ -82,6 +85,8 @@ def realize_chunk(job: Job, start: int, only: int | None = None) -> tuple[int, l
     ``only`` limits it to one realization.
     """
     shared, target = shared_survey(job.text, job.digest, job.packages), Path(job.path)
+    if job.holder:
+        check_held(target, job.holder)
     done = store.done(target, start, start + job.chunk)
     first, stop = max(start, job.first), min(start + len(done), job.stop)
     computed: dict[int, dict[str, NDArray]] = {}
@@ -137,9 +142,11 @@ def empty(count: int, like: NDArray) -> NDArray:
     return np.full((count, *like.shape[1:]), False if like.dtype == bool else np.nan, like.dtype)
 
 
-def summarise_node(path: str, layout: Layout, start: int, stop: int) -> Sums | None:
-    """Return the statistics of the realizations of a node of the tree, read chunk by chunk."""
+def summarise_node(path: str, layout: Layout, start: int, stop: int, holder: str = "") -> Sums | None:
+    """Return the statistics of the realizations of a node of the tree, read chunk by chunk; ``holder`` as of a job."""
     target = Path(path)
+    if holder:
+        check_held(target, holder)
     starts = range(start, stop, layout.chunk)
 
     def node(index: int) -> Sums | None:

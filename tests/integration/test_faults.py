@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -83,6 +84,31 @@ def test_a_task_given_up_for_lost_does_not_undo_another(
     job = tasks.Job(config.to_json(run), config.digest(run), str(copy), 4, 4, 6, tasks.packages())
     assert tasks.realize_chunk(job, 4) == (2, [])
     assert_same(copy, small_store)
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_worker_with_another_disk_is_refused_by_name(
+    there: bool, small_store: Path, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A store of another seed at the same path was summarised in place of the run's, and no realization stored."""
+    other = tmp_path / "node" / "x.zarr"
+    if there:
+        shutil.copytree(small_store, other)
+
+    def realize_chunk(job: tasks.Job, *rest: Any) -> Any:
+        return tasks.realize_chunk(replace(job, path=str(other)), *rest)
+
+    def summarise_node(_: str, *rest: Any) -> Any:
+        return tasks.summarise_node(str(other), *rest)
+
+    monkeypatch.setattr(batch, "realize_chunk", realize_chunk)
+    monkeypatch.setattr(batch, "summarise_node", summarise_node)
+    run = table()
+    run["ensemble"]["seed"] += 1
+    with refused(socket.gethostname(), other, "-o", by=RunError):
+        runner.run(run, tmp_path / "x.zarr", workers=client)
+    monkeypatch.undo()
+    assert runner.run(run, tmp_path / "x.zarr", workers=client).computed == len(store.done(small_store))
 
 
 def test_other_packages_are_refused_by_name(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

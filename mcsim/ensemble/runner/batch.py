@@ -12,7 +12,7 @@ from distributed import Client, KilledWorker
 from mcsim import config
 from mcsim.ensemble import plan, repair, store, summary
 from mcsim.ensemble.layout import Layout, listed
-from mcsim.ensemble.lock import locked
+from mcsim.ensemble.lock import holder, locked
 from mcsim.ensemble.runner.cluster import LOST, Roll, Workers, answers, check_workers, connected, death
 from mcsim.ensemble.tasks import Failure, Job, packages, realize_chunk, summarise_node
 from mcsim.errors import RunError
@@ -186,7 +186,7 @@ def _simulate(roll: Roll, target: Path, run: config.RunConfig, wanted: range, jo
     """Compute what is missing, chunk by chunk."""
     chunk, done = store.chunk(target), store.done(target)
     path = str(target.absolute())
-    job = Job(config.to_json(run), config.digest(run), path, chunk, wanted.start, wanted.stop, packages())
+    job = Job(config.to_json(run), config.digest(run), path, chunk, wanted.start, wanted.stop, packages(), holder())
     missing = {
         start: absent
         for start in range(wanted.start // chunk * chunk, wanted.stop, chunk)
@@ -232,7 +232,7 @@ def _summarise(roll: Roll, target: Path, layout: Layout, quiet: bool) -> None:
     size, node = layout.realizations, layout.chunk
     while node * 16 < size:
         node *= 2
-    calls = [(str(target.absolute()), layout, a, min(a + node, size)) for a in range(0, size, node)]
+    calls = [(str(target.absolute()), layout, a, min(a + node, size), holder()) for a in range(0, size, node)]
     arriving, arrived = answers(roll, summarise_node, calls), dict[int, Sums | None]()
     with reporting("summary", float(len(calls)), "nodes", quiet) as report:
 
