@@ -207,19 +207,10 @@ class StoredMaps(Source):
 def fits_maps(parts: tuple[Part, ...], template: str) -> FitsMaps:
     """Find the realizations of a template."""
     found = FitsMaps(parts, _label(template), template=os.path.abspath(template))
-    first = parts[0]
-    pattern, expression = "", ""
     try:
-        for text, field, _, _ in Formatter().parse(found.template):
-            pattern, expression = pattern + glob.escape(text), expression + re.escape(text)
-            if field is not None:
-                own = {"channel": first.channel, "split": first.split}.get(field)
-                pattern += "*" if own is None else glob.escape(own)
-                expression += r"(\d+)" if own is None else re.escape(own)
-        matches = [re.fullmatch(expression, path) for path in glob.glob(pattern)]
-        named = {match[0]: int(match[1]) for match in matches if match is not None and match.re.groups}
-        numbers = sorted(set(named.values()))
-        others = sorted(path for path, r in named.items() if str(found._path(first, r)) != path)
+        named = {path: (part, r) for part in parts for path, r in _numbered(found.template, part)}
+        numbers = sorted({r for _, r in named.values()})
+        others = sorted(path for path, (part, r) in named.items() if str(found._path(part, r)) != path)
     except (ValueError, KeyError, IndexError) as error:
         raise InputError(
             f"{template} is no template of files ({error}); use {{realization}}, {{channel}} and {{split}}."
@@ -240,6 +231,20 @@ def fits_maps(parts: tuple[Part, ...], template: str) -> FitsMaps:
             if not os.path.isfile(found._path(part, r)):
                 raise InputError(f"{found._path(part, r)} does not exist, the map {part.name} of realization {r}.")
     return FitsMaps(parts, found.label, template=found.template, realizations=tuple(numbers))
+
+
+def _numbered(template: str, part: Part) -> Iterator[tuple[str, int]]:
+    """Yield the files of one map that a template names, with the numbers of their realizations."""
+    pattern, expression = "", ""
+    for text, field, _, _ in Formatter().parse(template):
+        pattern, expression = pattern + glob.escape(text), expression + re.escape(text)
+        if field is not None:
+            own = {"channel": part.channel, "split": part.split}.get(field)
+            pattern += "*" if own is None else glob.escape(own)
+            expression += r"(\d+)" if own is None else re.escape(own)
+    for match in (re.fullmatch(expression, path) for path in glob.glob(pattern)):
+        if match is not None and match.re.groups:
+            yield match[0], int(match[1])
 
 
 def _label(template: str) -> str:

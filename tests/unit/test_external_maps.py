@@ -102,3 +102,14 @@ def test_folder_and_numerical_errors_of_a_simulator_are_its_own(
         np.testing.assert_array_equal(source.maps(0, realization), [np.arange(12.0)])
     assert Path.cwd() == tmp_path
     assert np.geterr() == errors
+
+
+@pytest.mark.parametrize("lost", ["V_2.fits", "W_2.fits"])
+def test_a_realization_that_lacks_a_map_is_not_left_out_in_silence(lost: str, tmp_path: Path) -> None:
+    """Where it was the first map of the description, one realization fewer was the ensemble."""
+    parts = (*PARTS, Part("W", "W", None, None, "galactic"))
+    files(tmp_path, [f"{c}_{r}.fits" for c in "VW" for r in range(4)])
+    assert fits_maps(parts, str(tmp_path / "{channel}_{realization}.fits")).count == 4
+    (tmp_path / lost).unlink()
+    with refused(tmp_path / lost, lost[0], 2):
+        fits_maps(parts, str(tmp_path / "{channel}_{realization}.fits"))
