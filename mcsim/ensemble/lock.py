@@ -8,6 +8,7 @@ import fcntl
 import os
 import socket
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -52,14 +53,17 @@ def holder() -> str:
 
 def check_held(path: Path, by: str) -> None:
     """Raise RunError on a worker that does not see the lock of the driver (:func:`holder`): its disk is another one."""
-    found = ""
-    with suppress(OSError):
-        found = _lock_of(path).read_text()
-    if found != by:
-        raise RunError(
-            f"A worker on {socket.gethostname()} does not see the driver's store {path}; choose with -o a folder that "
-            "driver and workers share."
-        )
+    lock = _lock_of(path)
+    for wait_s in (0.0, 1.0, 2.0):
+        time.sleep(wait_s)
+        with suppress(OSError):
+            os.listdir(lock.parent)  # a network disk then looks for new files
+            if lock.read_text() == by:
+                return
+    raise RunError(
+        f"A worker on {socket.gethostname()} does not see the driver's store {path}; choose with -o a folder that "
+        "driver and workers share."
+    )
 
 
 def _lock_of(path: Path) -> Path:
