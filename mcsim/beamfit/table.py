@@ -133,7 +133,9 @@ def identified(path: str | Path, table: Table) -> NDArray[np.int64]:
 
 def read_ecsv(path: str | Path) -> Table:
     """Read an ECSV table with rows and :data:`COLUMNS`; raise InputError for anything else."""
-    with unreadable(path, "an ECSV table", "give a store or such a table"):
+    if not Path(path).is_file():
+        raise InputError(f"{path} does not exist; give the folder of a store, or an ECSV table.")
+    with unreadable(path, "an ECSV table", "give such a table, or a folder: a store to fit, or maps to diagnose"):
         table = Table.read(path, format="ascii.ecsv")
     if len(table) == 0:
         raise InputError(f"{path} has no rows; give the measured bins.")

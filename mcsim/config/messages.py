@@ -125,6 +125,10 @@ def _text(item: ErrorDetails, key: str, tables: tuple[str, ...]) -> str:
         return f"{key}.kind = {shown(tag)} is unknown{_closest(tag, known)}; use one of {', '.join(known)}"
     if kind == "union_tag_not_found" and isinstance(item["input"], dict):
         return f"the key {key}.kind is missing; add it"
+    if key in _REPEATED and kind == "tuple_type" and isinstance(item["input"], dict):
+        return f"{stated} is a single table; write its header as {_REPEATED[key]}, once for each"
+    if kind == "dataclass_type" and isinstance(item["input"], list) and "." not in key:
+        return f"{stated} is a list of tables; there is one alone: write its header as [{key}]"
     if kind in _EXPECTED:
         return f"{stated} has the wrong type or value; give {_EXPECTED[kind]}"
     return f"{stated} cannot be used ({item['msg'].rstrip('.')}); correct it"
@@ -151,7 +155,9 @@ def _quoted(text: str) -> list[str]:
 
 
 def _closest(word: str, known: Iterable[str]) -> str:
-    match = difflib.get_close_matches(word, list(known), n=1)
+    names = list(known)
+    same = [name for name in names if name.lower() == word.lower()]  # L_max for l_max, not lmax
+    match = same or difflib.get_close_matches(word, names, n=1)
     return f" (did you mean {_REPEATED.get(match[0], match[0])}?)" if match else ""
 
 

@@ -116,12 +116,17 @@ def checked(model: Model, maps: Sequence[Map] | Mapping[str, Map]) -> list[Map]:
     return found
 
 
+def _listed(names: Iterable[str]) -> str:
+    """Return names in alphabetic order, at most three of them."""
+    found = sorted(names)
+    return ", ".join(found[:3]) + (f" and {len(found) - 3} more" if len(found) > 3 else "")
+
+
 def _warn_of_others(names: Iterable[str]) -> None:
     """Warn of what stands beside the maps, and may be one that the model should have."""
-    if found := sorted(names):
-        more = "" if len(found) < 4 else f" and {len(found) - 3} more"
+    if found := _listed(names):
         warnings.warn(
-            f"{', '.join(found[:3])}{more} in the data will not be looked at: no map of the model has that name; if it "
+            f"{found} in the data will not be looked at: no map of the model has that name; if it "
             "is an observed map, give the model its channel or split.",
             stacklevel=3,
         )
@@ -139,6 +144,9 @@ def _read(model: Model, part: Part, path: Path) -> Map:
     if not path.is_file():
         inside = first_realization(path.parent)
         remedy = "give it under that name" if inside == path.parent else f"give the folder of a realization, {inside}"
-        raise InputError(f"{path} does not exist; the model has a map {part.name}, {remedy}.")
+        known = file_names(model.survey.config).values()
+        other = _listed(each.name for each in path.parent.iterdir() if each.is_file() and each.name not in known)
+        beside = f" (the folder has {other})" if other else ""
+        raise InputError(f"{path} does not exist; the model has a map {part.name}, {remedy}{beside}.")
     map_ = read_uk(path, model.frame, model.survey.channels[part.channel].site.frequency_ghz)
     return checked_map(model, part, map_, str(path))

@@ -39,7 +39,11 @@ def opened(path: Path) -> Iterator[fits.HDUList]:
     # Opened here, not by astropy, which leaves the file open when its own warning is raised.
     with warnings.catch_warnings(), path.open("rb") as stream:
         warnings.filterwarnings("error", message=".*truncated.*", category=AstropyUserWarning)
-        with fits.open(stream) as hdus:
+        try:
+            hdus = fits.open(stream)
+        except OSError as error:  # of any other format, with a remedy that is astropy's own
+            raise OSError("it is no FITS file") if "No SIMPLE card" in str(error) else error from None
+        with hdus:
             yield hdus
 
 

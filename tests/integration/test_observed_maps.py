@@ -130,8 +130,8 @@ def test_data_in_antenna_temperature_are_read(small, folder):
 
 
 def test_a_missing_file_is_named(small, folder):
-    (folder / "W1_half2.fits").unlink()
-    with refused("W1_half2.fits", "W1:half2"):
+    (folder / "W1_half2.fits").rename(folder / "w1_half2.fits")
+    with refused("W1_half2.fits", "W1:half2", "w1_half2.fits"):
         read_maps(small.model, folder)
 
 

@@ -338,3 +338,6 @@ def test_truncated_empty_and_foreign_files_are_refused(tmp_path) -> None:
     for name in ("truncated", "text", "empty"):
         with refused(f"{name}.fits"):
             Beam.from_map(tmp_path / f"{name}.fits", 100)
+    with refused("text.fits", ".npy") as foreign:
+        Beam.from_map(tmp_path / "text.fits", 100)
+    assert "(it is no FITS file)" in str(foreign.value)

@@ -137,5 +137,9 @@ def test_tables_that_leave_a_choice_are_refused(lfi, tmp_path):
         mcsim.Beam.from_window(from_two)
     with refused(from_two, "extension"):
         mcsim.Beam.from_window(from_two, extension="X")
+    image = tmp_path / "image.fits"
+    fits.PrimaryHDU(np.ones((8, 8))).writeto(image)
+    with refused(image, "B_l", "kind"):
+        mcsim.Beam.from_window(image)
     with refused(tmp_path / "none.fits", by=mcsim.InputError):
         mcsim.Beam.from_window(tmp_path / "none.fits")

@@ -145,6 +145,8 @@ WRONG = [
     ("channel.1.scan.model", "wmpa", ("channel[V1].scan.model", "wmpa", "wmap")),
     ("channel.1.scan.sample_period_s", 0, ("channel[V1].scan.sample_period_s", 0)),
     ("channel.0.scan.psi0_deg", "x", ("channel[W1].scan.psi0_deg", "x")),
+    ("channel", {"name": "W1"}, ("channel", "[[channel]]")),
+    ("sky", [{"spectrum": "wmap7", "lmax": 32}], ("sky", "[sky]")),
     ("biposh.L_max", -1, ("biposh.L_max", -1, 0)),
     ("biposh.L_max", 129, ("biposh.L_max", 129, "lmax", 128)),
     ("biposh.lmax", 129, ("biposh.lmax", 129, "sky.lmax", 128)),
@@ -212,3 +214,9 @@ def test_skies_of_every_realization_are_looked_for(plain, folder):
         config.load(changed(run, "ensemble.realizations", 5))
     with refused("sky.map", "sky_009.fits"):
         config.check_skies(loaded, range(9, 10))
+
+
+def test_a_key_that_differs_in_case_alone_is_the_one_that_is_meant(plain, folder):
+    with refused("biposh.l_max") as found:
+        config.load(changed(plain, "biposh.l_max", 2))
+    assert "(did you mean L_max?)" in str(found.value)

@@ -142,8 +142,12 @@ def test_a_file_that_is_no_table(tmp_path):
     (tmp_path / "x.ecsv").write_text("not a table\n1 2 3\n")
     with refused("x.ecsv", "ECSV"):
         read_table(tmp_path / "x.ecsv", "ecliptic")
-    with refused("none.ecsv", "ECSV"):
+    with refused("none.ecsv", "ECSV") as absent:
         read_table(tmp_path / "none.ecsv", "ecliptic")
+    assert "does not exist" in str(absent.value)
+    (tmp_path / "map.fits").write_bytes(b"SIMPLE  = \xd7")
+    with refused("map.fits", "folder", "diagnose"):
+        read_table(tmp_path / "map.fits", "ecliptic")
 
 
 def test_errors_that_do_not_count_may_be_missing(tmp_path):

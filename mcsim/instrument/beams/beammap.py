@@ -262,7 +262,7 @@ def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Heade
         raise InputError(f"beam map {path} does not exist: give the path of a FITS image")
     if path.suffix == ".npy":
         return read_npy(path, "iuf", (2,)).astype(np.float64), fits.Header()
-    with unreadable(path, "a FITS image", "it may be truncated"), opened(path) as hdus:
+    with unreadable(path, "a FITS image", "give a whole one, or an array as .npy"), opened(path) as hdus:
         images = [hdu for hdu in hdus if hdu.is_image and hdu.data is not None]
         image = np.array(images[0].data, dtype=np.float64) if images else np.zeros(0)
         header = images[0].header.copy() if images else fits.Header()

@@ -111,6 +111,8 @@ def _chosen(
             found.append((name, match[0]))
         elif column is None and len(tables) == len(names) == 1:
             found.append((name, names[0]))
+    if not tables:
+        raise InputError(f'{path} has no table of B_l; give one, or a beam map as kind = "map" of a beam.')
     if len(found) != 1:
         columns = "; ".join(f"{name}: {', '.join(map(str, hdu.columns.names))}" for name, hdu in tables.items())
         raise InputError(
