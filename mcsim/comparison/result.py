@@ -135,6 +135,8 @@ class ChannelResult:
 
     def _found(self) -> str:
         size = f"{number(self.rms_uk)} uK rms, {number(self.accuracy)} of the sky"
+        if self.verdict == "identical" and self.rms_uk == 0.0:
+            return f"{self.name}: identical in every pixel."
         if self.verdict == "identical":
             return f"{self.name}: identical to an accuracy of {number(self.accuracy)} ({number(self.rms_uk)} uK rms)."
         if self.verdict == "unknown":

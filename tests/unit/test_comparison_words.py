@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mcsim.comparison.effects import EffectDifference
-from mcsim.comparison.result import DifferenceResult, NotCompared
+from mcsim.comparison.result import ChannelResult, DifferenceResult, NotCompared
 from mcsim.systematics.beams import BeamSidelobe
 
 
@@ -38,3 +38,16 @@ def test_sign_that_misleads_is_explained() -> None:
 )
 def test_a_map_that_is_not_compared_is_said_to_lack_on_each_side(missing_on, words) -> None:
     assert NotCompared("W1", missing_on).words == words
+
+
+@pytest.mark.parametrize(
+    ("rms", "words"), [(0.0, "in every pixel."), (1e-6, "to an accuracy of 1 × 10⁻⁸ (1 × 10⁻⁶ uK rms).")]
+)
+def test_maps_without_any_difference_are_not_called_accurate_to_zero(rms, words) -> None:
+    maps = np.zeros((1, 12))
+    found = ChannelResult(
+        *("W", ("W",), "identical", (), (), (), 0.0),
+        *(rms, 100.0, 0.0, 0.0, 0.0, (), 0.0),
+        *(maps, maps, maps, maps == 0.0, 0, None, ("W",)),
+    )
+    assert found.sentence() == f"W: identical {words}"
