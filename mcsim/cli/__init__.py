@@ -196,7 +196,7 @@ def diagnose(
     controls: Annotated[int, Option(min=0, help="Perfect data sets, drawn at higher fidelity and diagnosed too.")] = 0,
     workers: Processes = None,
     scheduler: Scheduler = None,
-    dry_run: Annotated[bool, Option("--dry-run", help="Read DATA; say what it takes; simulate none.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Read DATA; say what it takes; no verdict.")] = False,
 ) -> None:
     """Test maps against a model, and find the effect that the model lacks: where, how large, and if adding it helps."""
     # Threads that share small matrices wait for each other, while workers want their cores.

@@ -87,7 +87,9 @@ def diagnose(
     Returns
     -------
     DiagnosisResult
-        Verdict, fits, tests, and the arrays behind them.
+        Verdict (``kind``), fits, tests, and the arrays behind them. ``test.pvalue`` is the global p-value; the effects
+        of ``sets[0]`` have ``name``, ``channel``, ``amplitude``, ``sigma`` and ``unit``. Its ``open(output)`` reads it
+        again.
 
     Raises
     ------

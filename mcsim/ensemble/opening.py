@@ -59,9 +59,13 @@ def open_summary(path: str | Path) -> "xr.Dataset":
     Returns
     -------
     xarray.Dataset
-        ``biposh_mean``, ``biposh_standard_error``, ``biposh_standard_deviation``, the same ``_binned``, of ``cl`` and,
-        if the run is paired, of ``_circular`` and ``_difference``; uK^2. Errors and deviations of complex numbers are
-        those of both parts together, sqrt(re^2 + im^2).
+        ``biposh_mean``, ``_standard_error`` and ``_standard_deviation`` (of one realization), uK^2, shape (pair, mode,
+        ell); ``cl_mean`` and so on (pair, ell); if the run is paired the same of ``biposh_circular``,
+        ``biposh_difference``, ``cl_circular`` and ``cl_difference``. ``biposh_binned_mean`` and so on (pair, mode, bin)
+        are means over a bin, ``bin_first`` to ``bin_last``, of the raw coefficients times ``bin_factor`` (mode, ell),
+        which makes them l(l+1)/2pi A-hat, uK^2; ``biposh_binned_covariance`` (pair, mode, bin, bin_2) is that of one
+        realization, uK^4. Errors and deviations of complex numbers are those of both parts together,
+        sqrt(re^2 + im^2).
 
     Raises
     ------
