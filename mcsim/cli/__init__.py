@@ -383,7 +383,7 @@ def challenge_draws(
 
 
 @app.command(cls=Command)
-def effects(name: Annotated[str | None, Argument(metavar="EFFECT", help="Only this one.")] = None) -> None:
+def effects(name: Annotated[str | None, Argument(metavar="EFFECT", help="Only this name or FILE.py.")] = None) -> None:
     """List the library of effects: what a run can add and a diagnosis can find."""
     from mcsim import systematics as library
 
