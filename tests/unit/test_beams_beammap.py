@@ -8,6 +8,7 @@ from astropy.wcs import WCS
 from harmonics import legendre
 from mcsim import config
 from mcsim.instrument.beams import Beam, BeamMap, blm_of_map, find_centre, read_map
+from mcsim.plot.look import look_at_beams
 from mcsim.simulation.channels import load_beam_map
 from refusals import refused
 
@@ -341,3 +342,5 @@ def test_truncated_empty_and_foreign_files_are_refused(tmp_path) -> None:
     with refused("text.fits", ".npy") as foreign:
         Beam.from_map(tmp_path / "text.fits", 100)
     assert "(it is no FITS file)" in str(foreign.value)
+    with refused("text.fits", ".txt"):
+        list(look_at_beams(tmp_path / "text.fits"))

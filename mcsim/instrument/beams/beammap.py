@@ -253,7 +253,7 @@ _PROJECTIONS: dict[Projection, tuple[_Function, _Function, _Function]] = {
 
 def holds_image(path: str | Path) -> bool:
     """Return True if a FITS file holds an image, as beam maps do, and not just tables; InputError for no FITS."""
-    with unreadable(path, "a FITS file", "give a beam map or b_lm"), opened(Path(path)) as hdus:
+    with unreadable(path, "a beam", "give a beam map or b_lm as FITS, or B_l as .txt"), opened(Path(path)) as hdus:
         return any(hdu.is_image and hdu.header.get("NAXIS", 0) >= 2 for hdu in hdus)
 
 
