@@ -16,6 +16,9 @@ sys.path.insert(0, str(HERE.parent))
 os.environ["PYTHONPATH"] = os.pathsep.join([str(HERE.parent), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 
+from numpy.typing import ArrayLike  # noqa: E402
+from sphinx.util.typing import stringify_annotation  # noqa: E402
+
 import mcsim  # noqa: E402
 from mcsim import systematics  # noqa: E402
 
@@ -151,6 +154,16 @@ def _plain(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[s
             literal = indentation
 
 
+_ARRAY_LIKE = stringify_annotation(ArrayLike, "smart")
+
+
+def _named(
+    app: Any, what: str, name: str, obj: Any, options: Any, signature: str | None, returned: str | None
+) -> tuple[str | None, str | None]:
+    """Write ArrayLike by its name, which numpy's alias does not keep, in place of all that it stands for."""
+    return signature and signature.replace(_ARRAY_LIKE, "~numpy.typing.ArrayLike"), returned
+
+
 def _forget(app: Any) -> None:
     """Remove the pages of modules that are gone."""
     for page in (HERE / "reference" / "generated").glob("mcsim.*.rst"):
@@ -165,3 +178,4 @@ def setup(app: Any) -> None:
     app.connect("builder-inited", _forget, priority=1)
     app.connect("source-read", _public)
     app.connect("autodoc-process-docstring", _plain)
+    app.connect("autodoc-process-signature", _named)
