@@ -41,6 +41,7 @@ PAIRS = 20  #: pairs of random probes for each number whose Fisher matrix they e
 LEAST_PAIRS = 2  #: the least number of the same with which a matrix is inverted
 LEVELS = 1024  #: of the noise that predictions tell apart
 TOLERANCE = 1e-6  #: relative residual at which the inverse covariance of a map is found
+APART = 1e-8  #: smallest eigenvalue of the correlation of the Fisher matrix over the largest, of numbers told apart
 
 DIPOLE_UK = 100.0
 """Rms of the monopole and of the dipole that maps may have besides their sky, so that nothing is learnt from them."""
@@ -226,6 +227,17 @@ class Response(NamedTuple):
     matrix: Matrix
     unbiased: float = 1.0
 
+    def checked(self) -> "Response":
+        """Return the same; InputError if the maps do not tell its numbers apart, as behind a mask of nearly all."""
+        scale = np.sqrt(np.diag(self.matrix))
+        values = np.linalg.eigvalsh(divided(self.matrix, np.outer(scale, scale)))
+        if values[0] < APART * values[-1]:
+            raise InputError(
+                f"the maps do not tell the {len(scale)} numbers of all modes and bins apart that their filter measures "
+                "at once; raise biposh.summary_bin, lower biposh.L_max, or give a mask (map.mask) that leaves more sky."
+            )
+        return self
+
 
 def _unbiased(halves: Sequence[tuple[Matrix, float]], pairs: float) -> float:
     """Return the factor of an inverse from so many pairs of random probes.
@@ -280,9 +292,12 @@ class Filtering:
         return 0 if self.uniform else probes_of(self.bands, self.probes)
 
     def fisher(self, progress: Progress | None = None) -> tuple[Response, ...]:
-        """Return F of every pair, estimated once and kept in the cache; exact if no map needs random probes."""
+        """Return F of every pair, estimated once and kept in the cache; exact if no map needs random probes.
+
+        InputError if it cannot be inverted.
+        """
         if not self.drawn:
-            return tuple(Response(self._exact(number)) for number in range(len(self.pairs)))
+            return tuple(Response(self._exact(number)).checked() for number in range(len(self.pairs)))
 
         def fill(folder: Path) -> None:
             matrices, factors = zip(*self._estimated(progress), strict=True)
@@ -290,7 +305,7 @@ class Filtering:
 
         with np.load(folders.cached(f"filter-{self._key()}", fill) / "fisher.npz") as stored:
             each = enumerate(stored["factors"].tolist())
-            return tuple(Response(stored[f"arr_{number}"], factor) for number, factor in each)
+            return tuple(Response(stored[f"arr_{number}"], factor).checked() for number, factor in each)
 
     @cached_property
     def inverses(self) -> tuple[Matrix, ...]:

@@ -10,7 +10,7 @@ from mcsim.bipolar import Mode, estimate, estimator, parse_mode
 from mcsim.bipolar.modes import bin_factor
 from mcsim.instrument.beams import Beam
 from mcsim.simulation import convolve, simulate
-from mcsim.simulation.filtering import LOWEST, Bands, Filtering, MapFilter, _unbiased, unknown_dipole
+from mcsim.simulation.filtering import LOWEST, Bands, Filtering, MapFilter, Response, _unbiased, unknown_dipole
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap, product, unit_skies
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
@@ -324,3 +324,16 @@ def test_what_a_filter_cannot_bear_is_refused() -> None:
         config.load(plain)
     with refused(10, "biposh.probes"):
         _ = Filtering((map_filter(0),), ((0, 0),), TABLES, WIDTH, 10).drawn
+
+
+def test_more_numbers_than_the_maps_tell_apart_are_refused() -> None:
+    """Ten random forms of nine numbers are told apart, of eleven they are not, in whatever units they are."""
+    rng = np.random.default_rng(8)
+    for size in (9, 11):
+        forms = rng.standard_normal((size, 10)) * np.logspace(-6, 6, size)[:, None]
+        response = Response(forms @ forms.T)
+        if size > 10:
+            with refused(size, "biposh.summary_bin"):
+                response.checked()
+        else:
+            assert response.checked() is response
