@@ -170,6 +170,7 @@ def in_file(path: str) -> tuple[type[Effect], ...]:
         raise InputError(f"{path} cannot be run ({error}); mend it.") from error
     if _path_of(module) != file:
         raise InputError(f"{path} has the name of another module, {_path_of(module)}; rename it.")
+    setattr(module, _EFFECTS, (content, ()))  # of a file that is refused below: once mended, it is run again
     found = tuple(
         kind
         for _, kind in inspect.getmembers(module, inspect.isclass)

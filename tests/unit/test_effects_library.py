@@ -324,6 +324,19 @@ def test_a_file_that_is_written_anew_is_run_anew(tmp_path, monkeypatch):
         systematics.get(str(path))
 
 
+def test_a_file_that_is_mended_is_run_anew(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.path", list(sys.path))
+    monkeypatch.setenv("PYTHONPATH", "")
+    path = tmp_path / "mended_effect.py"
+    lines = "from mcsim.reconstruction import AddedPattern\n\n\nclass Of(AddedPattern):\n    name = 'of'\n"
+    path.write_text(f"{lines}    unit = ''\n")
+    for _ in range(2):
+        with refused(str(path), "unit"):
+            systematics.get(str(path))
+    path.write_text(f"{lines}    unit = 'uK'\n")
+    assert systematics.get(str(path)).unit == "uK"
+
+
 def test_a_file_named_like_a_module_of_python_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.path", list(sys.path))
     monkeypatch.setenv("PYTHONPATH", "")
