@@ -14,6 +14,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotate_alm
 from mcsim.sphere.sky import dipole_alm
+from mcsim.support.loading import once_per_content
 from mcsim.systematics.base import Alm, Bound, DirectedEffect, Draw, Effect, Site, Wording
 from mcsim.systematics.galaxy import template_alm
 from mcsim.systematics.parametrization import Angle, Parametrization, SkyVector, Vector
@@ -178,8 +179,8 @@ class SidelobePickup(Effect):
     galaxy_uk
         Mean brightness of the model of the Galaxy at b = 0, uK, at the channel's frequency; 0: the dipole alone.
     template
-        Path of a HEALPix map of the Galaxy in uK, in place of the model; its frame is what its header says, or
-        galactic.
+        Path of a HEALPix map of the Galaxy in place of the model; its frame and unit are what its header says, or
+        galactic and uK.
 
     Notes
     -----
@@ -219,7 +220,12 @@ class SidelobePickup(Effect):
             raise InputError(
                 f"effect {self.name}: width_deg = {self.width_deg:g} is no broad lobe; give at least {NARROWEST_DEG:g}."
             )
-        seen = _smoothed(replace(self, amplitude=1.0), tuple(map(float, site.dipole_uk)), site.frame)
+        where = self.width_deg, tuple(map(float, site.dipole_uk)), site.frame
+        seen = (
+            _on_template(self.template, site.frequency_ghz, *where)
+            if self.template
+            else _on_model(self.galaxy_uk, *where)
+        )
         outward, south, east = axes(theta, phi)
         away, towards = np.deg2rad(self.angle_deg), psi + np.deg2rad(self.towards_deg)
         centre = np.cos(away) * outward + np.sin(away) * (np.cos(towards) * south + np.sin(towards) * east)
@@ -241,14 +247,29 @@ def _plane_alm(lmax: int) -> Alm:
 
 
 @lru_cache(maxsize=4)
-def _smoothed(lobe: SidelobePickup, dipole_uk: tuple[float, ...], frame: str) -> NDArray[np.float64]:
-    """Return dipole and Galaxy as a lobe of unit response sees them, uK, at its direction in ``frame``."""
-    sigma = np.deg2rad(lobe.width_deg) / np.sqrt(8.0 * np.log(2.0))
-    lmax = int(np.ceil(6.0 / sigma))
-    if lobe.template:
-        galaxy = template_alm(lobe.template, lmax, frame)
-    else:
-        galaxy = rotate_alm(lobe.galaxy_uk * _plane_alm(lmax), lmax, "galactic", frame)
-    window = healpy.gauss_beam(np.deg2rad(lobe.width_deg), lmax)
+def _on_model(galaxy_uk: float, width_deg: float, dipole_uk: tuple[float, ...], frame: str) -> NDArray[np.float64]:
+    """Return what :func:`_smoothed` makes of the model of the Galaxy."""
+    lmax = _lmax(width_deg)
+    return _smoothed(rotate_alm(galaxy_uk * _plane_alm(lmax), lmax, "galactic", frame), width_deg, dipole_uk)
+
+
+@once_per_content(4)
+def _on_template(
+    path: str, frequency_ghz: float | None, width_deg: float, dipole_uk: tuple[float, ...], frame: str
+) -> NDArray[np.float64]:
+    """Return what :func:`_smoothed` makes of a map of the Galaxy."""
+    return _smoothed(template_alm(path, _lmax(width_deg), frame, True, frequency_ghz), width_deg, dipole_uk)
+
+
+def _lmax(width_deg: float) -> int:
+    """Return the degree at which nothing is left of a lobe."""
+    sigma = np.deg2rad(width_deg) / np.sqrt(8.0 * np.log(2.0))
+    return int(np.ceil(6.0 / sigma))
+
+
+def _smoothed(galaxy: Alm, width_deg: float, dipole_uk: tuple[float, ...]) -> NDArray[np.float64]:
+    """Return dipole and Galaxy, both in uK, as a lobe of unit response sees them, at its direction in their frame."""
+    lmax = _lmax(width_deg)
+    window = healpy.gauss_beam(np.deg2rad(width_deg), lmax)
     sky = alm_.multiply(galaxy + dipole_alm(dipole_uk, lmax), window, lmax)
     return np.asarray(healpix.synthesis(sky[None], _NSIDE, lmax)[0], dtype=np.float32)

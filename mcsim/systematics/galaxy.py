@@ -11,6 +11,7 @@ from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.checks import check_complete
+from mcsim.sphere.header import to_uk
 from mcsim.sphere.rotation import rotate_alm
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.support.loading import once_per_content
@@ -37,14 +38,17 @@ def morphology(template: str, site: Site, draw: Draw) -> Alm:
 
 
 @once_per_content(4)
-def template_alm(path: str, lmax: int, frame: str) -> Alm:
-    """Return the coefficients of a map, up to l = 2 nside, in ``frame``; its own frame is its header's, or galactic."""
-    values, found, _ = healpix.read_map(Path(path))
+def template_alm(path: str, lmax: int, frame: str, in_uk: bool = False, frequency_ghz: float | None = None) -> Alm:
+    """Return the coefficients of a map, up to l = 2 nside, in ``frame``; its own frame is its header's, or galactic.
+
+    They are in the unit of the file; ``in_uk``: in uK, by the unit that the header states, at a channel's frequency.
+    """
+    values, found, unit = healpix.read_map(Path(path))
     check_complete(values, path)
     if not np.any(values):
         raise InputError(f"{path} is zero in every pixel; give a complete template.")
     top = min(lmax, 2 * healpy.npix2nside(values.size))
-    alm = healpix.analysis(values, top, iterations=3)
+    alm = healpix.analysis(values, top, iterations=3) * (to_uk(unit, Path(path), frequency_ghz) if in_uk else 1.0)
     return rotate_alm(alm_.resize(alm, top, lmax), lmax, found or "galactic", frame)
 
 

@@ -155,6 +155,19 @@ def test_a_far_lobe_sees_the_galaxy_that_it_is_given(site, tmp_path):
     assert seen[plane & (x > 0.5)].mean() > 5.0 * seen[np.abs(np.cos(theta)) > 0.5].mean() > 0.0
 
 
+def test_a_far_lobe_reads_its_map_in_the_unit_of_the_header_and_again_when_it_changes(site, tmp_path):
+    file, nowhere = tmp_path / "galaxy.fits", np.ones(1)
+    effect = systematics.get("sidelobe_pickup")(amplitude=1.0, width_deg=30.0, template=str(file))
+    no_dipole = replace(site, dipole_uk=np.zeros(3), frequency_ghz=None)
+    for constant, unit, factor in ((100.0, "uK", 1.0), (300.0, "uK", 1.0), (0.5, "mK_CMB", 1e3), (2e-4, "K_CMB", 1e6)):
+        healpy.write_map(file, np.full(192, constant), coord="G", column_units=unit, dtype=np.float64, overwrite=True)
+        seen = effect.signal(nowhere, nowhere, nowhere, nowhere, no_dipole)
+        np.testing.assert_allclose(seen, factor * constant, rtol=1e-6)
+    healpy.write_map(file, np.ones(192), coord="G", column_units="MJy/sr", dtype=np.float64, overwrite=True)
+    with refused(str(file), "MJy/sr", "frequency_ghz"):
+        effect.signal(nowhere, nowhere, nowhere, nowhere, no_dipole)
+
+
 def test_what_is_added_to_samples_is_averaged_in_pixels_of_each_half(site):
     effect = systematics.get("orbital_dipole")(amplitude=0.1)
     first, second = (mean_signal((effect,), site, Part(share)) for share in ((0.0, 0.5), (0.5, 1.0)))
