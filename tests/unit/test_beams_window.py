@@ -135,6 +135,10 @@ def test_tables_that_leave_a_choice_are_refused(lfi, tmp_path):
     np.savetxt(from_two, np.stack([np.arange(2, 10), np.ones(8)], axis=1))
     with refused(from_two, "ell"):
         mcsim.Beam.from_window(from_two)
+    columns = {"ELL": np.arange(2, 10), "BL": WINDOW[2:10]}  # B_2 differs from 1 by less than B_0 may
+    table = written(tmp_path / "two.fits", hdu(columns, "BEAM"))
+    with refused(table, "ELL", "BEAM"):
+        mcsim.Beam.from_window(table)
     with refused(from_two, "extension"):
         mcsim.Beam.from_window(from_two, extension="X")
     image = tmp_path / "image.fits"

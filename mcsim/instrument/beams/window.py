@@ -19,6 +19,9 @@ Window = NDArray[np.float64]
 COLUMNS = ("BL", "B_L", "INT_BEAM", "NOMINAL", "TEMPERATURE", "T", "BEAM")
 """Names of columns of B_l, the surest first: LFI's instrument model, Planck's CMB maps, HFI's model and windows."""
 
+DEGREES = ("L", "ELL", "MULTIPOLE")
+"""Names of columns of ell."""
+
 SQUARED = re.compile(r"(?i)^w_?(l|ell)$|^b_?(l|ell)_?\^?(2|sq|squared)$|_2_")
 """Names of columns of W_l = B_l^2; those of Planck's HFI have _2_ in them."""
 
@@ -66,9 +69,14 @@ def _of_text(path: Path) -> Window:
         table = np.loadtxt(path, ndmin=2)
     if table.shape[1] == 1:
         return np.asarray(table[:, 0])
-    if not np.array_equal(table[:, 0], np.arange(len(table))):
-        raise InputError(f"{path} does not count ell from 0 in its first column; give every ell from 0 on.")
+    _check_counts(table[:, 0], f"{path} (first column)")
     return np.asarray(table[:, 1])
+
+
+def _check_counts(ell: NDArray, where: str) -> None:
+    """Raise InputError unless a column of ell counts from 0: B_l are taken by their place."""
+    if not np.array_equal(ell, np.arange(len(ell))):
+        raise InputError(f"{where} does not count ell from 0; give every ell from 0 on.")
 
 
 def holds_window(path: Path) -> bool:
@@ -87,7 +95,11 @@ def _of_fits(path: Path, extension: str | None, column: str | None) -> tuple[Win
             if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)
         }
         where, field = _chosen(path, tables, extension, column)
-        values = np.asarray(tables[where].data.field(field), dtype=np.float64).ravel()
+        table = tables[where]
+        for name in table.columns.names:
+            if name.upper() in DEGREES:
+                _check_counts(np.ravel(table.data.field(name)), f"{path} ({where}, {name})")
+        values = np.asarray(table.data.field(field), dtype=np.float64).ravel()
     return values, f"{path} ({where}, {field})"
 
 
