@@ -73,6 +73,15 @@ def test_the_extension_chooses_a_band(lfi):
     assert mcsim.Beam.from_window(lfi, extension="beamwf_030x030", column="bl").window == pytest.approx(WINDOW**2)
 
 
+def test_tables_of_one_name_are_told_apart_by_number(tmp_path):
+    path = written(tmp_path / "bands.fits", hdu({"BL": WINDOW}, "BEAM"), hdu({"BL": WINDOW**2}, "BEAM"))
+    for named in (None, "BEAM"):
+        with refused(path, 1, 2):
+            mcsim.Beam.from_window(path, extension=named)
+    for number, power in (("1", 1), ("2", 2)):
+        assert mcsim.Beam.from_window(path, extension=number).window == pytest.approx(WINDOW**power)
+
+
 def run_with(beam):
     channel = {"name": "W", "beam": beam, "scan": {"kind": "parallel_transport"}}
     sky = {"spectrum": "wmap7", "lmax": 40}

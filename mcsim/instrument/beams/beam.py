@@ -266,7 +266,8 @@ class Beam:
         lmax
             Largest degree, no more than the source's; ``None``: the source's.
         extension, column
-            Name (or number) of the FITS table, and of its column; ``None``: the only ones that can be B_l.
+            Name of the FITS table (its number, from 0, where it has none of its own), and of its column; ``None``:
+            the only ones that can be B_l.
 
         Returns
         -------

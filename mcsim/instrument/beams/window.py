@@ -89,9 +89,10 @@ def holds_window(path: Path) -> bool:
 def _of_fits(path: Path, extension: str | None, column: str | None) -> tuple[Window, str]:
     """Return B_l and the name of their table."""
     with unreadable(path, "a FITS table of B_l", "give another file"), opened(path) as hdus:
+        names = [str(hdu.name).strip() for hdu in hdus]
         tables = {
-            str(hdu.name).strip() or str(number): hdu
-            for number, hdu in enumerate(hdus)
+            name if name and names.count(name) == 1 else str(number): hdu
+            for number, (name, hdu) in enumerate(zip(names, hdus, strict=True))
             if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)
         }
         where, field = _chosen(path, tables, extension, column)
