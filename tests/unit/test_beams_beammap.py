@@ -329,6 +329,10 @@ def test_unusable_headers_are_refused(tmp_path) -> None:
             Beam.from_map(path, 100)
     with refused("cube.fits", "plane", 2, 0, 1):
         read_map(cube, plane=2)
+    np.save(tmp_path / "single.npy", image)
+    for single in (write(tmp_path / "single.fits", image), tmp_path / "single.npy"):
+        with refused(single, "plane", 2, 0):
+            read_map(single, plane=2, pixel_deg=0.05)
 
 
 def test_truncated_empty_and_foreign_files_are_refused(tmp_path) -> None:

@@ -261,19 +261,20 @@ def _read_image(path: Path, plane: int) -> tuple[NDArray[np.float64], fits.Heade
     if not path.is_file():
         raise InputError(f"beam map {path} does not exist: give the path of a FITS image")
     if path.suffix == ".npy":
-        return read_npy(path, "iuf", (2,)).astype(np.float64), fits.Header()
-    with unreadable(path, "a FITS image", "give a whole one, or an array as .npy"), opened(path) as hdus:
-        images = [hdu for hdu in hdus if hdu.is_image and hdu.data is not None]
-        image = np.array(images[0].data, dtype=np.float64) if images else np.zeros(0)
-        header = images[0].header.copy() if images else fits.Header()
+        image, header = read_npy(path, "iuf", (2,)).astype(np.float64), fits.Header()
+    else:
+        with unreadable(path, "a FITS image", "give a whole one, or an array as .npy"), opened(path) as hdus:
+            images = [hdu for hdu in hdus if hdu.is_image and hdu.data is not None]
+            image = np.array(images[0].data, dtype=np.float64) if images else np.zeros(0)
+            header = images[0].header.copy() if images else fits.Header()
     if not image.size:
         raise InputError(f"{path} holds no image: a beam map is a two-dimensional FITS image")
     if str(header.get("BUNIT", "")).strip().lower().startswith("db"):
         raise InputError(f"{path} is in {header['BUNIT']!r}: give the response itself, 10^(dB/10), not its logarithm")
-    if image.ndim == 3 and 0 <= plane < len(image):
-        image = image[plane]
-    elif image.ndim == 3:
-        raise InputError(f"plane = {plane} of {path} does not exist: it has planes 0 to {len(image) - 1}")
+    planes = image if image.ndim == 3 else image[None]
+    if not 0 <= plane < len(planes):
+        raise InputError(f"plane = {plane} of {path} does not exist: it has planes 0 to {len(planes) - 1}")
+    image = planes[plane]
     if image.ndim != 2:
         raise InputError(f"{path} has an image of {image.ndim} dimensions where a beam map has 2, or 3 with planes")
     return image, header
