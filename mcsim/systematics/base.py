@@ -367,8 +367,7 @@ def reach(effect: Effect) -> int:
     """Return 2 for an effect that mixes in signals of earlier samples, 1 for one that moves samples, 0 for others."""
     if effect.lags() is not None:
         return 2
-    nowhere = np.zeros(1)
-    return 0 if effect.moved(nowhere, nowhere, nowhere) is None else 1
+    return 0 if effect.moved(*np.zeros((3, 1))) is None else 1
 
 
 def rescaling(acting: Iterable[Effect], site: Site) -> float:
@@ -442,9 +441,10 @@ def streams(acting: Iterable[Effect]) -> Iterator[tuple[Effect, str]]:
 
 
 def scan_direction(angle_deg: float, period_deg: float = 360.0) -> str:
-    """Return a direction in the frame of the beam, x along the scan, in words."""
+    """Return a direction in the frame of the beam, x along the scan and y towards the spin axis, in words."""
     angle = (angle_deg + period_deg / 2.0) % period_deg - period_deg / 2.0
-    for at, words in ((0.0, "along the scan"), (90.0, "across the scan"), (180.0, "against the scan")):
+    side = f", {'towards' if angle > 0.0 else 'away from'} the spin axis" if period_deg > 180.0 else ""
+    for at, words in ((0.0, "along the scan"), (90.0, f"across the scan{side}"), (180.0, "against the scan")):
         if abs(abs(angle) - at) < _NAMED_WITHIN_DEG:
             return words
     return f"at {angle:.0f}° to the scan".replace("-", "−")

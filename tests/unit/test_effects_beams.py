@@ -11,6 +11,7 @@ from mcsim import systematics
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.beams.gaussian import SIGMA_PER_FWHM
 from mcsim.instrument.scan import ScanModel
+from mcsim.instrument.scan.pointing import pointing
 from mcsim.simulation import tod
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import gaussian_alm
@@ -282,3 +283,15 @@ def test_what_is_no_beam_is_refused():
         systematics.get("beam_sidelobe")(amplitude=0.1, width_sigmas=0.1).beam(beam, site)
     with refused("time_constant", "W1", "scan.model"):
         systematics.get("time_constant")(amplitude=0.1).pointing(beam, replace(site, pointing=None))
+
+
+@pytest.mark.parametrize(("angle_deg", "said", "nearer_deg"), [(90.0, "towards", 1.0), (-90.0, "away from", -1.0)])
+def test_what_lies_across_the_scan_is_said_with_its_side(angle_deg, said, nearer_deg):
+    """The spin axis of a scan without precession starts at longitude 0 of the ecliptic."""
+    model = replace(ScanModel.load("wmap"), precession_angle_deg=0.0)
+    line = model.line_of_sight("A")
+    effect = systematics.get("pointing_offset")(amplitude=60.0, angle_deg=angle_deg)
+    theta, phi, _ = effect.moved(*pointing(model, line, 0, 50))
+    distance_deg = np.rad2deg(np.arccos(np.sin(theta) * np.cos(phi)))
+    np.testing.assert_allclose(distance_deg, line.boresight_angle_deg - nearer_deg, atol=1e-3)
+    assert effect.describe().endswith(f"across the scan, {said} the spin axis")
