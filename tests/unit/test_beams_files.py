@@ -67,6 +67,7 @@ def test_more_than_the_file_holds_is_refused(tmp_path, beam, lmax, mmax, named) 
         ((0, 7), 0.5j, ("m = 0", "complex")),
         ((2, 9), complex(np.inf), ("finite",)),
         ((0, 0), complex(-1.0), ("positive",)),
+        ((0, 0), 0j, ("positive",)),
         ((1, 100), complex(50.0), ("m = 0", "pole")),
     ],
 )

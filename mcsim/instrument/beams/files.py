@@ -45,8 +45,8 @@ def checked_blm(source: str | Path | NDArray, lmax: int | None = None) -> tuple[
             f"has more than a fraction {LEAST_CIRCULAR_POWER}: rotate the beam to the pole before taking its "
             "coefficients"
         )
-    first = float(blm[0, 1].real / blm[0, 0].real / np.sqrt(3.0))
-    if blm[0, 0].real > 0.0 and not LEAST_FIRST_WINDOW < first < 2.0 - LEAST_FIRST_WINDOW:
+    first = float(blm[0, 1].real / blm[0, 0].real / np.sqrt(3.0)) if blm[0, 0].real > 0.0 else 1.0
+    if not LEAST_FIRST_WINDOW < first < 2.0 - LEAST_FIRST_WINDOW:
         raise InputError(
             f"{origin} has B_1 = {first:.3g} where any beam has nearly B_0 = 1: its coefficients are not b_lm with "
             "b_l0 = sqrt((2l+1)/4pi) B_l, so multiply or divide them by a power of sqrt(2l+1)"
