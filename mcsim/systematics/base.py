@@ -279,7 +279,7 @@ class Effect:
         """
         how = cls.wording or Wording(symbol=f" ({cls.unit})")
         if amplitude < 0.0 and how.negative is not None:
-            return how.negative.format(measured(-how.scale * amplitude, how.scale * sigma, how.symbol))
+            return how.negative.format(measured(-how.scale * amplitude + how.offset, how.scale * sigma, how.symbol))
         return how.text.format(measured(how.scale * amplitude + how.offset, how.scale * sigma, how.symbol))
 
     def within_bounds(self) -> Self:

@@ -60,7 +60,7 @@ class BeamEllipticity(Effect):
     name = "beam_ellipticity"
     scope = "channel"
     unit = "major/minor - 1"
-    wording = Wording("axis ratio {}", offset=1.0)
+    wording = Wording("axis ratio {}", offset=1.0, negative="axis ratio {} (turned by 90°)")
     cause = "Optics off the axis: defocus, coma-free astigmatism, or a horn that looks past the centre of the mirror."
     signature = "Even L, growing as l^2, fixed to the scan through w_2."
     source = "Joshi et al. arXiv:1210.7318, Sec. IV; Fosalba et al. 2002, Phys. Rev. D 65, 063003"
@@ -90,7 +90,7 @@ class BeamEllipticity(Effect):
         return stretched(beam, np.sqrt(ratio), 1.0 / np.sqrt(ratio), angle, 32, 2)
 
     def direction(self) -> str:
-        return "with the major axis " + scan_direction(self.angle_deg, 180.0)
+        return "with the major axis " + scan_direction(self.angle_deg + (90.0 if self.amplitude < 0.0 else 0.0), 180.0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -295,3 +295,14 @@ def test_what_lies_across_the_scan_is_said_with_its_side(angle_deg, said, nearer
     distance_deg = np.rad2deg(np.arccos(np.sin(theta) * np.cos(phi)))
     np.testing.assert_allclose(distance_deg, line.boresight_angle_deg - nearer_deg, atol=1e-3)
     assert effect.describe().endswith(f"across the scan, {said} the spin axis")
+
+
+def test_a_negative_ellipticity_is_said_as_the_beam_that_it_makes():
+    """Stretching across by 1.25 is no axis ratio of 0.75, nor of 1 / 1.25 = 0.8, along."""
+    beam = Beam.gaussian(600.0, lmax=40)
+    turned, same_beam = (
+        systematics.get("beam_ellipticity")(amplitude=a, angle_deg=b) for a, b in ((-0.25, 0), (0.25, 90))
+    )
+    same(turned.beam(beam, site_of(beam)), same_beam.beam(beam, site_of(beam)), 1e-12)
+    assert same_beam.describe() == "axis ratio 1.25 with the major axis across the scan"
+    assert turned.describe() == "axis ratio 1.25 (turned by 90°) with the major axis across the scan"
