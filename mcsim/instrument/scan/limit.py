@@ -126,7 +126,7 @@ def _line(model: ScanModel) -> LineOfSight:
     if not has_limit(model):
         raise InputError(
             f"scan model {model.name!r} precesses {model.orbit_period_s / abs(model.precession_period_s):.3g} times an "
-            f"orbit, but the long-time limit needs more than {_FAST_PRECESSION:g}; stream its moments instead."
+            f"orbit, but the long-time limit needs at least {_FAST_PRECESSION:g}; stream its moments instead."
         )
     return model.select()[0]
 
