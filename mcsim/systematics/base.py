@@ -441,9 +441,9 @@ def streams(acting: Iterable[Effect]) -> Iterator[tuple[Effect, str]]:
 
 
 def scan_direction(angle_deg: float, period_deg: float = 360.0) -> str:
-    """Return a direction in the frame of the beam, x along the scan and y towards the spin axis, in words."""
+    """Return a direction in the frame of the beam, x along the scan, in words; y is at +90°."""
     angle = (angle_deg + period_deg / 2.0) % period_deg - period_deg / 2.0
-    side = f", {'towards' if angle > 0.0 else 'away from'} the spin axis" if period_deg > 180.0 else ""
+    side = f" ({'+' if angle > 0.0 else '−'}90°)" if period_deg > 180.0 else ""
     for at, words in ((0.0, "along the scan"), (90.0, f"across the scan{side}"), (180.0, "against the scan")):
         if abs(abs(angle) - at) < _NAMED_WITHIN_DEG:
             return words

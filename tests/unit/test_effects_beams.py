@@ -285,16 +285,16 @@ def test_what_is_no_beam_is_refused():
         systematics.get("time_constant")(amplitude=0.1).pointing(beam, replace(site, pointing=None))
 
 
-@pytest.mark.parametrize(("angle_deg", "said", "nearer_deg"), [(90.0, "towards", 1.0), (-90.0, "away from", -1.0)])
+@pytest.mark.parametrize(("angle_deg", "said", "nearer_deg"), [(90.0, "+90°", 1.0), (-90.0, "−90°", -1.0)])
 def test_what_lies_across_the_scan_is_said_with_its_side(angle_deg, said, nearer_deg):
-    """The spin axis of a scan without precession starts at longitude 0 of the ecliptic."""
+    """+90° is towards the spin axis, which starts at longitude 0 of the ecliptic in a scan without precession."""
     model = replace(ScanModel.load("wmap"), precession_angle_deg=0.0)
     line = model.line_of_sight("A")
     effect = systematics.get("pointing_offset")(amplitude=60.0, angle_deg=angle_deg)
     theta, phi, _ = effect.moved(*pointing(model, line, 0, 50))
     distance_deg = np.rad2deg(np.arccos(np.sin(theta) * np.cos(phi)))
     np.testing.assert_allclose(distance_deg, line.boresight_angle_deg - nearer_deg, atol=1e-3)
-    assert effect.describe().endswith(f"across the scan, {said} the spin axis")
+    assert effect.describe().endswith(f"across the scan ({said})")
 
 
 def test_a_negative_ellipticity_is_said_as_the_beam_that_it_makes():

@@ -397,8 +397,8 @@ def test_a_power_is_that_of_the_map():
     ("name", "parameters", "order", "expected"),
     [
         ("pointing_offset", {"angle_deg": 0.0}, 1, "along the scan"),
-        ("pointing_offset", {"angle_deg": 90.0}, 1, "across the scan, towards the spin axis"),
-        ("pointing_offset", {"angle_deg": -90.0}, 1, "across the scan, away from the spin axis"),
+        ("pointing_offset", {"angle_deg": 90.0}, 1, "across the scan (+90°)"),
+        ("pointing_offset", {"angle_deg": -90.0}, 1, "across the scan (−90°)"),
         ("beam_ellipticity", {"angle_deg": 0.0}, 2, "along the scan"),
         ("beam_ellipticity", {"angle_deg": 90.0}, 2, "across the scan"),
         ("beam_ellipticity", {"angle_deg": 30.0}, 2, "at 30° to the scan"),
