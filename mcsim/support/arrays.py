@@ -43,7 +43,8 @@ def numbers(given: Any, name: str, masked: float | None = None) -> NDArray:
         hidden = int(np.ma.count_masked(given))
         if hidden and masked is None:
             raise InputError(f"{name} has {hidden} masked elements; give plain numbers, all of them.")
-        given = np.ma.filled(given.astype(np.float64), masked) if hidden else given.data
+        wide = np.result_type(given.dtype, np.float64)  # holds what stands for a masked element
+        given = np.ma.filled(given.astype(wide), masked) if hidden else given.data
     try:
         found = np.asarray(given)
     except (TypeError, ValueError) as error:

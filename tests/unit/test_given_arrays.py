@@ -58,6 +58,13 @@ def test_masked_elements_are_not_used(taking) -> None:
         take(masked)
 
 
+@pytest.mark.parametrize("kind", [complex, str])
+def test_masked_elements_hide_no_type(kind) -> None:
+    masked = np.ma.masked_array(MAP.astype(kind), MAP > 0.5)
+    with refused("map W"):
+        mcsim.prepare({"W": masked}, PREPARED)
+
+
 def test_texts_are_no_numbers(taking) -> None:
     array, take = taking
     with pytest.raises(InputError):
