@@ -31,6 +31,7 @@ class CaseSampler:
             names = sorted(self.out_of_library)
             return Drawn(kind=kind, members=(self._out_of_library(draw, names[turn % len(names)]),))
         if kind == "left_out":
+            self._check(1)
             order = rng.generator(seed, 0, "challenge/rotation").permutation(len(self.names))
             name = self.names[order[turn % len(order)]]
             return Drawn(kind=kind, members=(self._member(draw, name),), without=(name,))
@@ -38,18 +39,22 @@ class CaseSampler:
 
     def members(self, draw: np.random.Generator, wanted: int) -> tuple[Member, ...]:
         """Draw effects that act together, each with a strength of its own."""
+        self._check(wanted)
         members: dict[tuple[str, str | None], Member] = {}
-        known = sum(map(len, self._groups.values()))
-        if known < wanted:
-            raise InputError(
-                f"a case with {wanted} effects needs as many that reach a signal-to-noise ratio of "
-                f"{self.prior.weakest:g} at a possible amplitude, but the model has {known}; give it less noise or "
-                "more effects, or draw no such case."
-            )
         while len(members) < wanted:
             found = self._member(draw, self.names[int(draw.integers(len(self.names)))])
             members.setdefault(found.identity, found)
         return tuple(members.values())
+
+    def _check(self, wanted: int) -> None:
+        """Raise InputError if fewer effects than a case needs can be drawn."""
+        known = sum(map(len, self._groups.values()))
+        if known < wanted:
+            raise InputError(
+                f"a case with {wanted} effect{'s' * (wanted > 1)} needs as many that reach a signal-to-noise ratio of "
+                f"{self.prior.weakest:g} at a possible amplitude, but the model has {known}; give it less noise or "
+                "more effects, or draw no such case."
+            )
 
     def kinds(self, seed: int, count: int, out_of_library: bool = False) -> list[Kind]:
         """Draw the kinds of the first cases of a challenge; that of a case does not depend on their number."""

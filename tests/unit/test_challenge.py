@@ -103,6 +103,9 @@ def test_more_effects_than_can_be_drawn_are_refused():
     sampler = CaseSampler(Prior(none=0, one=0, two=1, left_out=0), model)
     with refused(2, 1):
         sampler.draw(sampler.kinds(1, 1), 1, 0)
+    sampler = CaseSampler(Prior(none=0, one=0, two=0, left_out=1, weakest=1e90, strongest=1e91), model)
+    with refused(1, 1e90, 0):
+        sampler.draw(sampler.kinds(1, 1), 1, 0)
 
 
 def test_fresh_data_leave_all_simulations_to_the_covariance(learned):
