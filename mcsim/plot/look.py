@@ -35,8 +35,9 @@ def look_at_beams(
 
     ``source`` is a TOML configuration or packaged workflow (every channel is shown), or a file: a FITS image is a beam
     map, a FITS table holds b_lm or, in a single column, B_l, a text (.txt, .dat) B_l. ``lmax`` is by default 2048, or
-    what the file holds or its pixels resolve, ``m_max`` chosen from the beam, and ``pixel_deg``, the side of a pixel of
-    a beam map in degrees, read from its header. InputError for what the source does not have, or says itself.
+    what the file holds or its pixels resolve, and of b_lm or B_l in a run its ``sky.lmax``; ``m_max`` is chosen from
+    the beam, and ``pixel_deg``, the side of a pixel of a beam map in degrees, read from its header. InputError for what
+    the source does not have, or says itself.
     """
     path = Path(source)
     if path.is_dir() or (not path.exists() and path.suffix not in ("", ".toml")):
@@ -48,11 +49,12 @@ def look_at_beams(
         for channel in run.channels:
             spec = channel.beam
             image = channels.load_beam_map(channel.name, spec) if isinstance(spec, config.BeamMap) else None
-            yield _look_at(channel.name, channels.load_beam(channel, lmax or LMAX), image)
+            tabled = isinstance(spec, config.BeamBlm | config.BeamWindow)
+            degree = lmax or (run.sky.lmax if tabled else _reach(image))
+            yield _look_at(channel.name, channels.load_beam(channel, degree), image)
     elif path.suffix not in (".txt", ".dat") and beams.holds_image(path):
         image = beams.read_map(path, pixel_deg=pixel_deg)
-        degree = min(LMAX, int(np.pi / image.pixel_rad)) if lmax is None else lmax
-        yield _look_at(path.name, beams.Beam.from_map(image, degree, m_max), image)
+        yield _look_at(path.name, beams.Beam.from_map(image, lmax or _reach(image), m_max), image)
     elif path.suffix in (".txt", ".dat") or beams.holds_window(path):
         _refuse(f"{source} holds B_l of a circular beam, which has no", "", m_max=m_max or None, pixel_deg=pixel_deg)
         window = beams.read_window(path, lmax)
@@ -60,6 +62,11 @@ def look_at_beams(
     else:
         _refuse(f"{source} holds b_lm, which have no", "", pixel_deg=pixel_deg)
         yield _look_at(path.name, beams.Beam.from_blm(path, lmax, m_max), None)
+
+
+def _reach(image: beams.BeamMap | None) -> int:
+    """Return the highest degree that is shown by default, and that the pixels of a beam map resolve."""
+    return LMAX if image is None else min(LMAX, int(np.pi / image.pixel_rad))
 
 
 def _refuse(why: str, end: str, **options: float | None) -> None:

@@ -118,6 +118,19 @@ def test_a_text_of_a_window_is_shown(tmp_path):
             list(look_at_beams(path, **asked))
 
 
+def test_beams_of_a_run_are_shown_as_far_as_their_files_reach(tmp_path):
+    wmap_text(tmp_path)
+    y, x = np.mgrid[-12:13, -12:13] * 1.0
+    fits.writeto(tmp_path / "map.fits", np.exp(-(x**2 + y**2) / 4))
+    beams = ('kind = "window", path = "ampl_bl_W1.txt"', 'kind = "map", path = "map.fits", pixel_deg = 1.0')
+    for number, beam in enumerate(beams):
+        text = f'name = "W"\nsky = {{ spectrum = "wmap7", lmax = {LMAX} }}\nmap = {{ nside = 32 }}\n[[channel]]\n'
+        path = tmp_path / f"run{number}.toml"
+        path.write_text(f'{text}name = "W"\nscan = {{ kind = "parallel_transport" }}\nbeam = {{ {beam} }}\n')
+        [look] = look_at_beams(path)
+        assert f" {(LMAX, 180)[number]}, " in look.text.partition("lmax, mmax")[2]
+
+
 @pytest.mark.parametrize(
     ("values", "named"),
     [
