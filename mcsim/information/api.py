@@ -258,11 +258,9 @@ def _candidates(
     analysis = analysis_of(run, settings.without, nthreads, fits, library)
     known = {c.name for c in analysis.candidates}
     known |= {f"{c.name}:{c.channel}" for c in analysis.candidates if c.channel is not None}
-    for name, width in settings.nuisances.items():
+    for name in settings.nuisances:
         if name not in known:
             raise InputError(f"nuisance {name!r} is no effect of this model; choose from {', '.join(sorted(known))}.")
-        if not 0.0 < width < np.inf:
-            raise InputError(f"nuisance {name} has a width of {width:g}; give the width of its prior, above 0.")
     priors: dict[tuple[str, str | None], list[Candidate]] = {}
     wanted = []
     for candidate in analysis.candidates:

@@ -1,7 +1,10 @@
 """What the limit of a model is computed of, and how."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from numbers import Real
+from typing import Any
 
 from mcsim.errors import InputError
 from mcsim.support.settings import check_settings
@@ -69,10 +72,14 @@ class LimitSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raise InputError for settings of another kind, negative numbers, and levels that mean nothing."""
+        """Raise InputError for settings of another kind, negative numbers, levels and widths that mean nothing."""
         check_settings(self)
         if not isinstance(self.nuisances, Mapping):
             raise InputError(f"nuisances = {self.nuisances!r} is no dict; give widths, as {{'calibration': 0.01}}.")
+        given: Mapping[str, Any] = self.nuisances
+        for name, width in given.items():
+            if not isinstance(width, Real) or not 0.0 < float(width) < math.inf:
+                raise InputError(f"nuisance {name} has a width of {width!r}; give that of its prior, a number above 0.")
         if self.tolerance == 0.0:
             raise InputError("tolerance = 0 is never reached; give a relative residual above 0, such as 1e-7.")
         for name in ("alpha", "power", "separation"):

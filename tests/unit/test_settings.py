@@ -55,6 +55,12 @@ def test_wrong_settings_are_refused(kind, name, value) -> None:
         kind(**{name: value})
 
 
+@pytest.mark.parametrize("width", ["0.1", None, 0.0, -1.0, float("nan"), float("inf")])
+def test_a_width_of_a_nuisance_that_is_none_is_refused(width) -> None:
+    with refused("beam_width", width):
+        LimitSettings(nuisances={"beam_width": width})
+
+
 def test_usual_settings_are_taken() -> None:
     assert DiagnosisSettings(alpha=1, simulations=300, without=["x"], beam_bins=(5, 2, 1, 1, 1)).simulations == 300
     assert DiagnosisSettings.quick(controls=3).sims_per_element < DiagnosisSettings().sims_per_element
