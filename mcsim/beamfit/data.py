@@ -155,7 +155,10 @@ def from_store(path: str | Path, selection: Selection = EVERYTHING) -> Measureme
         if a >= first and b <= last
     )
     if not rows:
-        raise InputError(f"no bin of {path} lies within ell = {first} ... {last}; its bins are {width} wide, widen it.")
+        raise InputError(
+            f"no bin of {path} lies within ell = {first} ... {min(last, lmax)}; its bins are {width} wide and end at "
+            f"ell = {lmax}, choose a range that holds one."
+        )
     drawn = realizations(path, rows, SUMMARY, chosen, label)
     measured = np.atleast_1d(np.isfinite(drawn).all(axis=0))
     kept = tuple(row for row, keep in zip(rows, measured, strict=True) if keep)

@@ -61,7 +61,8 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
             sigmas.append(error[same] * (1.0 if mode.M == 0 else np.sqrt(0.5)))
     if not rows:
         raise InputError(
-            f"{path} has no row of {', '.join(selection.modes)} within ell = {first} ... {last}; choose others."
+            f"{path} has no row of {', '.join(selection.modes)} within ell = {first} ... {min(last, high.max())}, and "
+            f"ends at ell = {high.max()}; choose others."
         )
     if len(set(rows)) < len(rows):
         raise InputError(f"{path} gives a bin of one mode twice; keep one row of each.")

@@ -133,6 +133,12 @@ def test_refusals(tmp_path, made, arguments, named):
         read(tmp_path, made, **arguments)
 
 
+def test_a_range_without_an_end_is_said_with_that_of_the_data(tmp_path):
+    with refused("L2M0d0", 5000, 29) as caught:
+        read(tmp_path, table(), ell_range=(5000, 1 << 30))
+    assert str(1 << 30) not in str(caught.value)
+
+
 def test_both_orders_of_a_pair_of_maps_are_read(tmp_path):
     found = read(tmp_path, table(d=[2, 2, -2], pair=["a,b"] * 3), modes=["L2M0d2", "L2M0d-2"])
     assert [row.mode.d for row in found.rows] == [2, 2, -2]
