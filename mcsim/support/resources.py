@@ -37,10 +37,6 @@ def names(kind: str) -> tuple[str, ...]:
     return _found(_PACKAGE, kind)[1]
 
 
-def _folder(kind: str) -> Path:
-    return _found(_PACKAGE, kind)[0]
-
-
 @cache
 def _found(package: Path, kind: str) -> tuple[Path, tuple[str, ...]]:
     """Return the folder of a kind and the names in it: looked up once, as every survey asks for them."""
@@ -50,12 +46,13 @@ def _found(package: Path, kind: str) -> tuple[Path, tuple[str, ...]]:
 
 
 def _find(noun: str, kind: str, suffix: str, name_or_path: str | Path) -> Path:
-    if str(name_or_path) in names(kind):
-        return _folder(kind) / f"{name_or_path}{suffix}"
+    folder, known = _found(_PACKAGE, kind)
+    if str(name_or_path) in known:
+        return folder / f"{name_or_path}{suffix}"
     path = user_path(name_or_path)
     if os.path.isfile(path):  # False also for a name that no file system takes
         return path.resolve()
     raise InputError(
         f"{noun} {str(name_or_path)!r} is neither a file (looked for {str(path)!r}) nor packaged with mcsim; "
-        f"give a path or one of: {', '.join(names(kind)) or 'none is packaged'}."
+        f"give a path or one of: {', '.join(known) or 'none is packaged'}."
     )
