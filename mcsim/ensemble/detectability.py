@@ -16,10 +16,9 @@ from mcsim.bipolar.theory import (
     signal_to_noise,
 )
 from mcsim.ensemble import plan, summary
-from mcsim.ensemble.expectation import L_WEIGHTS, Means, spectrum
+from mcsim.ensemble.expectation import L_WEIGHTS, Means, nearer, spectrum
 from mcsim.simulation.survey import Survey
 from mcsim.support.arrays import divided
-from mcsim.systematics import spread_of
 
 MONOPOLE = Mode(0, 0, 0)
 
@@ -64,7 +63,7 @@ def scattered(survey: Survey, found: dict[tuple[int, int], Means], number: int) 
     """
     channel = next(one for one in survey.channels if survey.maps[number] in one.maps)
     degrees = np.arange(survey.lmax + 1)
-    window = channel.window[: survey.lmax + 1] ** (spread_of(channel.effects) ** 2 - 1.0)
+    window = nearer(survey, channel)[: survey.lmax + 1]
     beam = np.sqrt(4.0 * np.pi / (2.0 * degrees + 1.0)) * channel.beam.blm[0, : survey.lmax + 1].real * window
     own = found[number, number]
     monopole = survey.estimator.modes.index(MONOPOLE)

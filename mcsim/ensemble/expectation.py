@@ -78,12 +78,21 @@ def scanned_beams(survey: Survey, L_max: int, nthreads: int = 1) -> tuple[Scanne
         _check_covered(channel)
     return tuple(
         ScannedBeam(
-            channel.beam.blm * channel.window ** (systematics.spread_of(channel.effects) ** 2),
+            channel.beam.blm * channel.window * nearer(survey, channel),
             _orientations(spec.scan, channel, _weighted(survey, m), L_max, nthreads),
         )
         for spec, channel in zip(survey.config.channels, survey.channels, strict=True)
         for m in channel.maps
     )
+
+
+def nearer(survey: Survey, channel: Channel) -> NDArray[np.float64]:
+    """Return the factor of the pixel window of samples that stand nearer to the centres, shape (lmax + 1,).
+
+    That of a preparation, which is in the window of the channel too, is not of samples and stays.
+    """
+    made = next(one for one in survey.making.channels if one.name == channel.name)
+    return np.asarray(made.window ** (systematics.spread_of(channel.effects) ** 2 - 1.0))
 
 
 def _check_covered(channel: Channel) -> None:
@@ -109,7 +118,7 @@ def dipoles_left(survey: Survey) -> dict[str, float]:
     rms_uk = float(np.sqrt(np.sum((2.0 * np.arange(cl.size) + 1.0) * cl) / (4.0 * np.pi)))
     found = {}
     for channel in survey.channels:
-        window = channel.window ** (systematics.spread_of(channel.effects) ** 2)
+        window = channel.window * nearer(survey, channel)
         fiducial = convolve.response(channel.site.beam, channel.site.lmax, window).factors[:2, 1]
         change = np.zeros(2, dtype=np.complex128)
         change[: channel.response.mmax + 1] += channel.response.factors[:2, 1]

@@ -338,6 +338,22 @@ def test_too_little_sky_is_refused_where_a_preparation_is_declared(tmp_path):
     assert power.neglected(enough) is None
 
 
+def test_samples_at_the_centres_of_fine_pixels_are_predicted_in_coarse_ones():
+    """Without the blur of the fine pixels, which the analysis divides out; the means over them blur all the same."""
+    beam, scan = {"kind": "gaussian", "fwhm_arcmin": 400.0}, {"kind": "parallel_transport"}
+    changes = {
+        "map": {"nside": FINE, "pixel_window": "computed"},
+        "channel": [{"name": "W", "beam": beam, "scan": scan}],
+        "effect": [{"name": "pixelization", "channel": "W", "amplitude": 1.0}],
+        "biposh": {"lmax": 20},
+    }
+    run = run_with({"kind": "degrade", "nside": COARSE}, **changes)
+    shared = survey(replace(run, sky=replace(run.sky, dipole_uk=3000.0)))
+    [channel], ell = shared.channels, np.arange(21)
+    expected = shared.cl[ell] * (channel.beam.window / healpix.pixel_window(FINE, shared.config.sky.lmax))[ell] ** 2
+    assert mcsim.predict(shared).cl_mean.values[0] == pytest.approx(expected, rel=1e-9)  # no warning of a dipole
+
+
 def every_command(run, folder):
     """What a user may do with a run, the maps of which are at nside 32."""
     return (
