@@ -128,10 +128,8 @@ class Preparation:
         return weight
 
     def moments(self, moments: Moments) -> Moments:
-        """Return hits and orientation moments of the prepared pixels: plain means, as of the temperatures."""
-        seen = moments.hits > 0
-        hits = np.where(seen, moments.hits, np.nan)
-        w = np.where(seen, moments.w, np.nan)
+        """Return hits, sums over the prepared pixels, and orientation moments, plain means as of the temperatures."""
+        hits, w = moments.hits, np.where(moments.hits > 0, moments.w, np.nan)
         for step in self.steps:
             hits, w = step.local(hits), step.orientations(w)
         hits = hits * (moments.nside / self.nside) ** 2

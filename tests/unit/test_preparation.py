@@ -13,6 +13,7 @@ from mcsim.config import preparation as declared
 from mcsim.diagnosis.api import _warnings
 from mcsim.ensemble import plan
 from mcsim.ensemble.prepare import prepare_files
+from mcsim.instrument import scan
 from mcsim.simulation import power, sampled, simulate, windows
 from mcsim.simulation.preparation import preparation
 from mcsim.simulation.steps import Average, Filled, Regression, Rotated, Weighted
@@ -65,6 +66,14 @@ def test_averages_are_those_of_healpy(rng):
     found = prepare(run_with({"kind": "degrade", "nside": COARSE}), map_uk)
     assert found == pytest.approx(healpy.ud_grade(map_uk, COARSE), rel=1e-12)
     assert np.any(found == healpy.UNSEEN)
+
+
+def test_coarse_pixels_have_the_hits_of_the_fine_ones_that_are_observed(rng):
+    hits = np.where(rng.random(NPIX) < 0.6, 10.0, 0.0)
+    steps = preparation(run := run_with({"kind": "degrade", "nside": COARSE}), run.channels[0], None)
+    found = steps.moments(scan.Moments(FINE, "ecliptic", hits, np.zeros((1, NPIX), dtype=complex))).hits
+    variance = steps.noise_uk(50.0 * (hits > 0.0), hits) ** 2  # of a mean of n pixels 50^2 / n
+    assert found * variance == pytest.approx(np.full(found.size, 10.0 * 50.0**2))
 
 
 def test_two_averages_are_one(rng):
@@ -340,17 +349,16 @@ def test_too_little_sky_is_refused_where_a_preparation_is_declared(tmp_path):
 
 def test_samples_at_the_centres_of_fine_pixels_are_predicted_in_coarse_ones():
     """Without the blur of the fine pixels, which the analysis divides out; the means over them blur all the same."""
-    beam, scan = {"kind": "gaussian", "fwhm_arcmin": 400.0}, {"kind": "parallel_transport"}
+    channel = {"name": "W", "beam": {"kind": "gaussian", "fwhm_arcmin": 400.0}, "scan": {"kind": "parallel_transport"}}
     changes = {
         "map": {"nside": FINE, "pixel_window": "computed"},
-        "channel": [{"name": "W", "beam": beam, "scan": scan}],
-        "effect": [{"name": "pixelization", "channel": "W", "amplitude": 1.0}],
+        **{"channel": [channel], "effect": [{"name": "pixelization", "channel": "W", "amplitude": 1.0}]},
         "biposh": {"lmax": 20},
     }
-    run = run_with({"kind": "degrade", "nside": COARSE}, **changes)
-    shared = survey(replace(run, sky=replace(run.sky, dipole_uk=3000.0)))
-    [channel], ell = shared.channels, np.arange(21)
-    expected = shared.cl[ell] * (channel.beam.window / healpix.pixel_window(FINE, shared.config.sky.lmax))[ell] ** 2
+    sky = {"spectrum": "wmap7", "lmax": 60, "dipole_uk": 3000.0}
+    shared, ell = survey(run_with({"kind": "degrade", "nside": COARSE}, sky=sky, **changes)), np.arange(21)
+    beam, fine = shared.channels[0].beam.window, healpix.pixel_window(FINE, shared.config.sky.lmax)
+    expected = shared.cl[ell] * (beam / fine)[ell] ** 2
     assert mcsim.predict(shared).cl_mean.values[0] == pytest.approx(expected, rel=1e-9)  # no warning of a dipole
 
 
