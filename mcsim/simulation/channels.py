@@ -189,11 +189,16 @@ def _refuse_noise(run: config.RunConfig, spec: config.Channel, acting: tuple[sys
 
 
 def _warn_of_orders(run: config.RunConfig, spec: config.Channel, beam: beams.Beam, fiducial: beams.Beam) -> None:
-    """Warn of a change of the beam whose orders the file of moments of a channel does not have."""
+    """Warn of a change of the beam whose orders a file of moments does not have; refuse a file without its own."""
     if not isinstance(spec.scan, config.ScanMoments) or beam.mmax <= fiducial.mmax:
         return
     paths = [config.channel_path(spec.scan.path, spec.name, split) for split in run.map.each_split]
     smax = min(scan.read_moments(path).smax for path in paths)
+    if smax < fiducial.mmax:
+        raise InputError(
+            f"the moments of {spec.name} end at s = {smax}, but its beam has orders up to {fiducial.mmax}; give "
+            "moments up to these, or lower its m_max."
+        )
     change = beam.blm.copy()
     change[: fiducial.mmax + 1] -= fiducial.blm
     power = power_by_order(change)

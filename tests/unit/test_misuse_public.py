@@ -261,6 +261,17 @@ def test_orders_that_a_file_of_moments_lacks_are_warned_of(smax, warned, tmp_pat
     assert [f"end at s = {smax}, which leaves out 10 %" in str(one.message) for one in told] == [True] * warned
 
 
+def test_a_file_of_moments_without_the_orders_of_the_beam_is_refused_whatever_effects_add(tmp_path: Path) -> None:
+    """An effect on the beam cut it, at m = 2 here, of which nothing was said where the effect has few orders beyond."""
+    path = tmp_path / "moments.fits"
+    write_moments_fits(path, Moments.parallel_transport(nside=NSIDE, smax=2))
+    beam = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 900.0, "fwhm_minor_arcmin": 600.0, "m_max": 4}
+    channel = CHANNEL | {"beam": beam, "scan": {"kind": "moments", "path": str(path)}}
+    for effects in ([], [{"name": "beam_ellipticity", "channel": "W", "amplitude": 0.1}]):
+        with refused("moments", 4):
+            mcsim.run(run(effect=effects, channel=[channel]), tmp_path / "x.zarr")
+
+
 @pytest.mark.parametrize(
     ("effect", "named"),
     [
