@@ -78,7 +78,8 @@ def _beam_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter | 
         change[:rows] += sign * beam.blm[:rows, : lmax + 1]
     spread = effect.spread()
     if spread != 1.0:
-        window = np.maximum(owner.window[: lmax + 1], np.finfo(float).tiny)
+        # Samples that stand closer change the window of their pixels, not that of a preparation.
+        window = np.maximum(model.survey.making.channels[channel].window[: lmax + 1], np.finfo(float).tiny)
         rows = min(before.mmax, top) + 1
         change[:rows] += before.blm[:rows, : lmax + 1] * (window ** (spread * spread - 1.0) - 1.0)
     if not change.any():

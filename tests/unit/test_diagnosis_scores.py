@@ -1,6 +1,7 @@
 """What scores are made of, and that it is made once."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import healpy
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from mcsim import bipolar, config, systematics
 from mcsim.datavector.analysis import analysis_of
+from mcsim.datavector.matched_filters import matched_filter
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import model_of, shared_sky, wiener_filter
 from mcsim.instrument.beams import Beam
@@ -220,3 +222,17 @@ def test_biposh_lmax_is_that_of_the_scan_alone() -> None:
     expected = bipolar.estimate(reference, alm_.multiply(sky, whole.model.inverse_cl, 12), sky)
     sums = found._sums(filtered)[0, list(FRAMES).index(whole.model.frame)]
     np.testing.assert_allclose(sums.sum(axis=1), np.nan_to_num(expected)[:, 2:].sum(axis=1), rtol=1e-12)
+
+
+def test_samples_that_stand_closer_leave_the_window_of_a_preparation() -> None:
+    """The matched filter of ``pixelization`` on degraded maps is that of the fine pixels."""
+    lmax, fine = 12, {"nside": 32, "pixel_window": "computed"}
+    run = _shown(40, 10.0, map=fine, biposh={"lmax": lmax}, preparation=[{"kind": "degrade", "nside": 8}])
+    model = model_of(survey(run), DiagnosisSettings())
+    closer = matched_filter(model, systematics.get("pixelization")(amplitude=0.1), 0)
+    assert closer is not None
+    orders = np.zeros((len(model.parts), model.settings.beam_orders + 1, model.lmax + 1))
+    orders[0, 0, lmax] = 1.0
+    filtered: Any = SimpleNamespace(orders=orders)
+    change = healpix.pixel_window(32, lmax)[lmax] ** (0.9**2 - 1.0) - 1.0
+    assert closer(filtered) == pytest.approx(model.survey.channels[0].beam.blm[0, lmax].real * change, rel=1e-9)
