@@ -194,11 +194,7 @@ def _warn_of_orders(run: config.RunConfig, spec: config.Channel, beam: beams.Bea
         return
     paths = [config.channel_path(spec.scan.path, spec.name, split) for split in run.map.each_split]
     smax = min(scan.read_moments(path).smax for path in paths)
-    if smax < fiducial.mmax:
-        raise InputError(
-            f"the moments of {spec.name} end at s = {smax}, but its beam has orders up to {fiducial.mmax}; give "
-            "moments up to these, or lower its m_max."
-        )
+    refuse_short(spec.name, smax, fiducial)
     change = beam.blm.copy()
     change[: fiducial.mmax + 1] -= fiducial.blm
     power = power_by_order(change)
@@ -208,6 +204,15 @@ def _warn_of_orders(run: config.RunConfig, spec: config.Channel, beam: beams.Bea
             f"effects give the beam of {spec.name} orders up to {beam.mmax}, but its moments end at s = {smax}, "
             f"which leaves out {100.0 * lost:.0f} % of the power of the change; give moments up to s = {beam.mmax}.",
             stacklevel=3,
+        )
+
+
+def refuse_short(channel: str, smax: int, fiducial: beams.Beam) -> None:
+    """Refuse moments up to s = smax without orders of the model's own beam, whatever effects add to them."""
+    if smax < fiducial.mmax:
+        raise InputError(
+            f"the moments of {channel} end at s = {smax}, but its beam has orders up to {fiducial.mmax}; give moments "
+            "up to these, or lower its m_max."
         )
 
 
@@ -325,22 +330,27 @@ def _with_m_max(spec: config.Channel, m_max: int | None) -> config.Channel:
 
 def with_all_orders(run: config.RunConfig) -> config.RunConfig:
     """Return a run whose beams, where no m_max is given, have all orders that a map without noise shows."""
-    return replace(run, channels=tuple(_with_all_orders(spec, run.sky.lmax) for spec in run.channels))
+
+    def full(spec: config.Channel) -> config.Channel:
+        of_all = partial(_with_all_orders, spec.name, lmax=run.sky.lmax)
+        return replace(spec, beam=of_all(spec.beam), beam_b=None if spec.beam_b is None else of_all(spec.beam_b))
+
+    return replace(run, channels=tuple(map(full, run.channels)))
 
 
-def _with_all_orders(spec: config.Channel, lmax: int) -> config.Channel:
-    if isinstance(spec.beam, CIRCULAR) or spec.beam.m_max is not None:
+def _with_all_orders(channel: str, spec: config.Beam, lmax: int) -> config.Beam:
+    if isinstance(spec, CIRCULAR) or spec.m_max is not None:
         return spec
-    own = beam = load_beam(spec, lmax)
+    own = beam = _beam(channel, spec, lmax)
     for orders in range(min(MOST_ORDERS, lmax), own.mmax, -1) if own.neglected_power > NEGLECTED else ():
         try:
-            beam = load_beam(_with_m_max(spec, orders), lmax)
+            beam = _beam(channel, replace(spec, m_max=orders), lmax)
         except InputError:  # a file of fewer orders
             continue
         break
     while beam.mmax > own.mmax and (cut := beam.truncated(beam.mmax - 1)).neglected_power <= NEGLECTED:
         beam = cut
-    return _with_m_max(spec, beam.mmax)
+    return replace(spec, m_max=beam.mmax)
 
 
 def described(spec: config.Channel) -> tuple[systematics.Pointing | None, float | None]:

@@ -20,6 +20,7 @@ from mcsim.simulation.channels import (
     refuse_excess,
     refuse_external,
     refuse_pixel_effects,
+    refuse_short,
     scan_model,
     site_b_of,
     site_of,
@@ -240,6 +241,7 @@ def _channel(
                 path = config.channel_path(spec.scan.path, spec.name, split)
                 wanted = smax if smax == site.beam.mmax else None
                 moments = _moments_of_file(path, grid.nside, wanted, grid.frame)
+                refuse_short(spec.name, moments.smax, site.beam)
             else:
                 moments = _moments(spec, split, grid, max(smax, 1), nthreads, progress)
             if run.map.split_by == "rings" and _whole_survey(spec.scan):

@@ -76,6 +76,18 @@ def test_a_beam_of_few_orders_stays_as_it_is():
     assert load_beam(with_all_orders(run).channels[0], 32).mmax == 2
 
 
+def test_each_beam_of_a_pair_has_the_orders_of_its_own():
+    """Those of side A were given to side B, and a circular side A left side B as it was."""
+    oval = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 500.0, "fwhm_minor_arcmin": 350.0}
+    [plain] = with_all_orders(config.load(small(beam=oval))).channels
+    for beam in ({"kind": "gaussian", "fwhm_arcmin": 400.0}, oval | {"m_max": 2}):
+        pair = {"beam": beam, "beam_b": oval, "scan": {"kind": "differencing", "model": "wmap", "pair": "WMAP"}}
+        run = small()
+        [full] = with_all_orders(config.load(run | {"channel": [run["channel"][0] | pair]})).channels
+        assert full.beam_b == plain.beam
+        assert full.beam_b.m_max > 2
+
+
 def test_a_small_turn_of_a_beam_without_m_max_is_no_other_ellipse(whole):
     found = mcsim.compare(whole(), whole(psi=lambda p: p + np.deg2rad(0.3)), whole.run)
     assert names(found) == ["psi_offset"]

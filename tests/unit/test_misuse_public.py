@@ -268,8 +268,11 @@ def test_a_file_of_moments_without_the_orders_of_the_beam_is_refused_whatever_ef
     beam = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 900.0, "fwhm_minor_arcmin": 600.0, "m_max": 4}
     channel = CHANNEL | {"beam": beam, "scan": {"kind": "moments", "path": str(path)}}
     for effects in ([], [{"name": "beam_ellipticity", "channel": "W", "amplitude": 0.1}]):
+        model = run(effect=effects, channel=[channel])
         with refused("moments", 4):
-            mcsim.run(run(effect=effects, channel=[channel]), tmp_path / "x.zarr")
+            mcsim.run(model, tmp_path / "x.zarr")
+        with refused("moments", 4):
+            mcsim.predict(model)
 
 
 @pytest.mark.parametrize(
