@@ -5,6 +5,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any, TypeVar, get_args
 
+import numpy as np
+
 from mcsim.errors import InputError
 
 Kind = TypeVar("Kind")
@@ -23,13 +25,16 @@ def check_settings(settings: Any, shares: Iterable[str] = (), least: Mapping[str
     """Raise InputError unless the fields of a dataclass are of the kind of their defaults, and numbers not negative.
 
     Those named in ``shares`` lie between 0 and 1, and what is in ``least`` is no less than that. An ``int | None`` is
-    whole. Items of a tuple of numbers are such numbers, and there are some.
+    whole. Items of a tuple of numbers are such numbers, and there are some. Numbers of numpy become those of Python,
+    by which results are known.
     """
     bounded, least = set(shares), least or {}
     for field in fields(settings):
         value, default = getattr(settings, field.name), field.default
         if value is default:
             continue
+        if value is not (plain := _plain(value)):
+            object.__setattr__(settings, field.name, value := plain)
         if default is None and int in get_args(field.type):
             default = 1
         if isinstance(default, tuple) and (isinstance(value, str) or not isinstance(value, tuple | list)):
@@ -44,6 +49,13 @@ def check_settings(settings: Any, shares: Iterable[str] = (), least: Mapping[str
                 kind = "a whole number" if isinstance(default, int) else "a number"
                 limit = "from 0 to 1" if largest == 1.0 else f"of {smallest} or more"
                 raise InputError(f"{field.name} = {value!r} is out of range; give {kind} {limit}.")
+
+
+def _plain(value: Any) -> Any:
+    """Return a value, or the items of a tuple or list, without scalars of numpy."""
+    if isinstance(value, tuple | list) and any(isinstance(one, np.generic) for one in value):
+        return type(value)(_plain(one) for one in value)
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _check_items(name: str, values: Iterable[Any], default: float, smallest: float) -> None:

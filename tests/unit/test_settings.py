@@ -1,5 +1,9 @@
 """Settings that are changed by name: of another kind, negative or beyond a probability they are refused."""
 
+import json
+from dataclasses import asdict
+
+import numpy as np
 import pytest
 
 from mcsim import DiagnosisSettings, LimitSettings
@@ -71,3 +75,12 @@ def test_a_number_of_simulations_that_is_given_is_that_of_a_sample_covariance() 
     assert DiagnosisSettings().shrinks(None)
     assert not DiagnosisSettings(shrunk=False).shrinks(None)
     assert not DiagnosisSettings.quick().shrinks(500)
+
+
+def test_numbers_of_numpy_are_those_of_python() -> None:
+    """A count of np.int64, as of np.arange, was refused with the range that it is in."""
+    given = DiagnosisSettings(simulations=np.int64(300), alpha=np.float32(0.5), beam_bins=tuple(np.ones(5, dtype=int)))
+    plain = DiagnosisSettings(simulations=300, alpha=0.5, beam_bins=(1, 1, 1, 1, 1))
+    assert json.dumps(asdict(given)) == json.dumps(asdict(plain))
+    with refused("simulations", -3):
+        DiagnosisSettings(simulations=np.int64(-3))
