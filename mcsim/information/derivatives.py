@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mcsim.datavector.analysis import Analysis
 from mcsim.datavector.campaign import with_effects
 from mcsim.datavector.candidate import Candidate
+from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.simulation import convolve, simulate
 from mcsim.simulation.survey import Channel, Survey, survey
@@ -144,8 +145,8 @@ def _derivative(analysis: Analysis, candidate: Candidate, basis: Effect, observe
     plus, minus = _quiet(upper), _quiet(lower)
     if fit.stochastic and fit.sign < 0:
         # What is drawn is a Gaussian sky of its own with a power proportional to the amplitude.
-        factor = _power_factor(fiducial, replace(basis, amplitude=abs(basis.amplitude)), fit.coordinates(basis))
         own_survey = _quiet(survey(only, nthreads=nthreads, library=known))
+        factor = _power_factor(own_survey, replace(basis, amplitude=abs(basis.amplitude)), fit.coordinates(basis))
         return Derivative(maps, own_survey, None, 1.0, observe, factor, np.zeros_like(dipole), noise, True)
     changed = [name for name in _HOOKS if acts_through(kind, name)]
     if not run.effects and not set(changed) - {"beam", "pointing"}:
@@ -191,17 +192,25 @@ def _noise_change(plus: Survey, minus: Survey, width: float) -> Maps | None:
     return change if change.any() else None
 
 
-def _power_factor(fiducial: Survey, effect: Effect, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return Q_l / 2 C_l for an effect that adds a random sky of spectrum Q_l times its coordinate.
+def _power_factor(own: Survey, effect: Effect, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return Q_l / 2 C_l for an effect that adds a random sky of spectrum Q_l times its coordinate, in all channels.
 
     The covariance changes by P Q P^t, as it does by P F S P^t + P S F P^t with F this factor.
     """
-    assert fiducial.cl is not None  # a model of the analysis has one
-    site, lmax = fiducial.channels[0].site, fiducial.config.sky.lmax
-    empty = np.zeros(alm_.size(lmax), dtype=np.complex128)
-    power = np.zeros(lmax + 1)
+    assert own.cl is not None  # a model of the analysis has one
+    lmax, power = own.config.sky.lmax, np.zeros(own.config.sky.lmax + 1)
+
+    def drawn(channel: Channel, realization: int) -> Alm:
+        empty = np.zeros(alm_.size(lmax), dtype=np.complex128)
+        return looked_at((effect,), empty, channel.site, own.config.ensemble.seed, realization)
+
+    first, *others = own.channels
+    if not all(np.allclose(drawn(channel, 0), drawn(first, 0)) for channel in others):
+        raise InputError(
+            f"effect {effect.name} has sign = -1, so that the power it draws is one for all channels, but it draws "
+            'another sky in every one; give it scope = "channel", or leave it out.'
+        )
     for realization in range(DRAWS):
-        drawn = looked_at((effect,), empty, site, fiducial.config.ensemble.seed, realization)
-        power += alm_.power(drawn, lmax)
+        power += alm_.power(drawn(first, realization), lmax)
     power /= DRAWS * (2.0 * np.arange(lmax + 1) + 1.0) * float(np.linalg.norm(coordinates))
-    return divided(power, 2.0 * fiducial.cl)
+    return divided(power, 2.0 * own.cl)

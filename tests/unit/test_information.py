@@ -330,18 +330,6 @@ def test_unknown_dipole_hides_one_that_all_maps_share() -> None:
     assert found.effects[0].sigma > 1.1 * known.effects[0].sigma
 
 
-def test_power_of_random_sources_is_that_of_their_spectrum() -> None:
-    """F = sum (2l + 1)/2 (B_l^2 / C_l)^2 over l >= 2 for a flat spectrum, by draws that are 64 for each mode."""
-    run = one_map()
-    found = mcsim.limit(run, settings=mcsim.LimitSettings(only=("point_sources",), dense=True))
-    window = survey(run).channels[0].response.factors[0].real ** 2
-    ell, cl = np.arange(7), load("wmap7", 6)
-    noise = 4.0 * np.pi / (12 * 16**2) * 300.0**2
-    each = (2 * ell + 1) / 2 * (window / (cl * window + noise)) ** 2
-    scatter = np.sqrt(np.sum((each[2:] * 2.0) ** 2 * 2.0 / (64 * (2 * ell[2:] + 1)))) / each[2:].sum()
-    assert found.fisher[0, 0] == pytest.approx(each[2:].sum(), rel=4.0 * scatter)
-
-
 @pytest.mark.slow
 def test_orders_of_the_fiducial_beams_change_little() -> None:
     """The inverse covariance of circular beams in place of the elliptical ones: sigma within 2 %."""
