@@ -16,6 +16,7 @@ def write_npy(path: Path, array: NDArray) -> None:
 
     Of a full disk numpy.save says no more than "20700 requested and 17392 written", without the number of the error.
     """
+    path.unlink(missing_ok=True)  # another process may have the old file mapped to its memory
     with path.open("wb") as stream:
         np.save(SimpleNamespace(write=stream.write), array, allow_pickle=False)
 

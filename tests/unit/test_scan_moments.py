@@ -1,13 +1,15 @@
+import errno
 import os
 import signal
 from dataclasses import replace
+from unittest.mock import Mock
 
 import healpy
 import numpy as np
 import pytest
 from astropy.io import fits
 
-from mcsim.errors import InputError
+from mcsim.errors import InputError, RunError
 from mcsim.instrument.scan.accumulate import stream_sums
 from mcsim.instrument.scan.files import read_moments, write_moments_fits
 from mcsim.instrument.scan.geometry import MapGrid
@@ -151,6 +153,21 @@ def test_save_and_load(tmp_path, mmap):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(moments, name))
     (tmp_path / "m" / "w.npy").unlink()
     with refused("w.npy"):
+        Moments.load(tmp_path / "m")
+
+
+def test_moments_saved_in_the_place_of_others_are_whole_or_none(tmp_path, monkeypatch):
+    """What a full disk left was the new hits beside the old orders, and who had the old ones mapped saw them change."""
+    old, new = (Moments.parallel_transport(8, psi0_deg, 2) for psi0_deg in (10.0, 20.0))
+    old.save(tmp_path / "m")
+    mapped = Moments.load(tmp_path / "m")
+    new.save(tmp_path / "m")
+    np.testing.assert_array_equal(mapped.w, old.w)
+    np.testing.assert_array_equal(Moments.load(tmp_path / "m").w, new.w)
+    monkeypatch.setattr("mcsim.instrument.scan.moments.write_npy", Mock(side_effect=OSError(errno.ENOSPC, "full")))
+    with pytest.raises(RunError, match="full"):
+        old.save(tmp_path / "m")
+    with refused("m"):
         Moments.load(tmp_path / "m")
 
 

@@ -375,9 +375,10 @@ class Moments:
         return {"kind": "moments", "path": "moments.npz"}
 
     def save(self, folder: str | Path) -> None:
-        """Write the arrays as .npy files into ``folder``, which is created."""
+        """Write the arrays as .npy files into ``folder``, which is created; they take the place of moments in it."""
         with folders.unwritable(folder := folders.user_path(folder), "choose another, in MCSIM_CACHE for the cache"):
             folder.mkdir(parents=True, exist_ok=True)
+            (folder / _META).unlink(missing_ok=True)  # without it the folder holds none, until all is written
             for name, array in self._arrays().items():
                 write_npy(folder / f"{name}.npy", array)
             meta = {"nside": self.nside, "frame": self.frame, "offsets": self.offset_order}
@@ -439,9 +440,8 @@ def cached_moments(
 ) -> Path:
     """Return the folder, for :meth:`Moments.load`, with the moments of a survey's default lines of sight.
 
-    They are streamed (:func:`mcsim.instrument.scan.accumulate.stream_sums`) if they are not in the cache yet: that of
-    ``cache_dir``, or of :func:`mcsim.support.folders.default_cache_dir`. The folder appears complete or not at all;
-    InputError if it cannot be written.
+    They are streamed (:func:`mcsim.instrument.scan.accumulate.stream_sums`) if they are not in the cache yet:
+    ``cache_dir``, by default that of all commands. The folder appears whole or not; InputError if it cannot be written.
     """
 
     def fill(folder: Path) -> None:
