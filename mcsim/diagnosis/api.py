@@ -36,13 +36,13 @@ from mcsim.errors import InputError
 from mcsim.reconstruction import simulated_scores
 from mcsim.simulation import power
 from mcsim.support import folders
-from mcsim.support.code import class_digest, package_digest
+from mcsim.support.code import LIBRARIES, class_digest, package_digest
 from mcsim.support.settings import settings_of
 
 CODE = ("config", "sphere", "stats", "instrument", "systematics", "bipolar", "simulation", "beamfit", "datavector")
-EXTERNAL = ("external", "external_maps")
-LIBRARIES = ("ducc0", "healpy", "numpy", "scipy")
 """What the simulations of a model and their data vectors are computed with."""
+
+EXTERNAL = ("external", "external_maps")  #: modules of ``ensemble`` by which those of another simulator are read
 
 
 class Computing(TypedDict, total=False):

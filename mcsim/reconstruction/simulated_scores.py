@@ -47,7 +47,7 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.support import folders
 from mcsim.support.arrays import Map, Matrix, Vector, divided
-from mcsim.support.code import class_digest, package_digest
+from mcsim.support.code import LIBRARIES, class_digest, package_digest
 from mcsim.support.npy import write_npy
 from mcsim.systematics import Pointing
 from mcsim.systematics.spacecraft import axes, heading, spin_phase
@@ -369,8 +369,11 @@ def null_scores(analysis: Analysis, ask: Ask, chosen: tuple[str, ...] = ()) -> M
     pairs = zip(analysis.run.nuisances, analysis.nuisances, strict=True)
     run = replace(analysis.run, nuisances=tuple(table for table, one in pairs if not one.subtractable))
     science = config.science(run, *(("nuisance",) if run.nuisances else ()))
-    identity = [science | {"ensemble": {}}, SIMULATIONS, chosen, package_digest(f"mcsim.{name}" for name in CODE)]
-    identity += [
+    identity = [
+        science | {"ensemble": {}},
+        SIMULATIONS,
+        chosen,
+        package_digest((f"mcsim.{name}" for name in CODE), LIBRARIES),
         asdict(replace(analysis.settings, without=(), including=())),
         sorted(map(class_digest, analysis.acting)),
     ]

@@ -23,6 +23,8 @@ from typing import Any
 import cloudpickle
 import numpy as np
 
+LIBRARIES = ("ducc0", "healpy", "numpy", "scipy")  #: what maps, and numbers of them, are computed with
+
 UNSENDABLE = (TypeError, pickle.PicklingError)  #: raised by what cannot be sent to a worker
 
 

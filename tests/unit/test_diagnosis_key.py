@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from mcsim import config
@@ -14,7 +15,7 @@ from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import api
 from mcsim.reconstruction import simulated_scores
-from mcsim.support import resources
+from mcsim.support import code, resources
 
 SOURCE = """
 from mcsim.systematics import Effect
@@ -69,6 +70,26 @@ def test_a_constant_of_any_package_that_computes_is_learned_anew(plugin, monkeyp
     text = "".join(path.read_text() for name in api.CODE for path in (folder / name).rglob("*.py"))
     used = set(re.findall(r"^ *from mcsim(?:\.| import )(\w+)", text, re.MULTILINE))
     assert {f"mcsim.{name}" for name in used - NOTHING_COMPUTED} <= read
+
+
+def test_simulations_and_scores_are_made_anew_with_another_library(plugin, monkeypatch, tmp_path):
+    """Scores were known by the code alone."""
+    effect, names = importlib.import_module("effects_of_a_user").Tilt, []
+
+    def cached(name, fill):
+        names.append(name)
+        np.save(tmp_path / "scores.npy", np.zeros(1))
+        return tmp_path
+
+    monkeypatch.setattr(simulated_scores.folders, "cached", cached)
+    analysis = SimpleNamespace(run=RUN, nuisances=(), settings=DiagnosisSettings(), acting=set())
+    for ducc0 in ("0.1", "0.2"):
+        monkeypatch.setattr(code, "version", lambda library, ducc0=ducc0: ducc0 if library == "ducc0" else "1")
+        code._package_digest.cache_clear()
+        names.append(key(effect))
+        simulated_scores.null_scores(analysis, None)
+    code._package_digest.cache_clear()
+    assert len(set(names)) == 4
 
 
 NO_SCORE = {
