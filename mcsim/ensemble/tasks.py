@@ -19,7 +19,7 @@ from mcsim.simulation import simulate
 from mcsim.simulation.survey import Survey, survey
 from mcsim.stats import streaming
 from mcsim.stats.streaming import Sums
-from mcsim.support.code import version
+from mcsim.support.code import package_digest, version
 
 ATTEMPTS = 3
 PAUSE_S = 0.1
@@ -53,9 +53,13 @@ class Job:
 
 
 def packages() -> tuple[tuple[str, str], ...]:
-    """Return the versions of the packages that a realization's bits, or the store's files, depend on."""
+    """Return the versions of the packages that a realization's bits, or the store's files, depend on.
+
+    Checkouts of mcsim that differ have the same version: the hash of its code is beside it.
+    """
     names = ("mcsim", "numpy", "scipy", "ducc0", "healpy", "zarr", "numcodecs")
-    return ("python", ".".join(platform.python_version_tuple()[:2])), *((name, version(name)) for name in names)
+    python, code = ".".join(platform.python_version_tuple()[:2]), package_digest(["mcsim"])[:12]
+    return ("python", python), *((name, version(name)) for name in names), ("code of mcsim", code)
 
 
 def check_same_packages(where: str, theirs: Iterable[tuple[str, str]], own: Iterable[tuple[str, str]]) -> None:

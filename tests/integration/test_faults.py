@@ -13,7 +13,6 @@ import time
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -112,9 +111,12 @@ def test_a_worker_with_another_disk_is_refused_by_name(
 
 
 def test_other_packages_are_refused_by_name(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch, "packages", lambda: (*tasks.packages()[:-1], ("numcodecs", "0.1")))
-    with refused(socket.gethostname(), "numcodecs", version("numcodecs"), 0.1):
-        runner.run(table(), tmp_path / "x.zarr", workers=client)
+    """Another checkout of mcsim, of the same version, is another package."""
+    own = dict(tasks.packages())
+    for name, other in (("numcodecs", "0.1"), ("code of mcsim", "0123456789ab")):
+        monkeypatch.setattr(batch, "packages", lambda changed=own | {name: other}: tuple(changed.items()))
+        with refused(socket.gethostname(), name.split()[-1], own[name], other):
+            runner.run(table(), tmp_path / "x.zarr", workers=client)
 
 
 def test_completed_gives_every_result_once(client: Client) -> None:
