@@ -1,30 +1,46 @@
 """The hooks by which an effect acts, and what those of a user's effect may return."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from mcsim.errors import InputError
+from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan import Moments
 
 HOOKS = (
     *("sky", "beam", "pointing", "gain", "signal", "noise", "excess"),
     *("spread", "orientations", "differencing", "moved", "lags"),
 )
 
-_OF_THE_SHAPE_OF = {"sky": "the sky", "gain": "the times", "signal": "the times", "excess": "the counts"}
-"""What the first argument of a hook is, where what it returns has the same shape."""
+_RETURNED = {
+    "sky": "one complex coefficient for each of the sky",
+    "beam": "a mcsim.Beam",
+    "pointing": "a mcsim.Beam",
+    "gain": "one real value for each of the times",
+    "signal": "one real value for each of the times",
+    "noise": "one real value for each pixel",
+    "excess": "one real value for each of the counts",
+    "spread": "a number",
+    "orientations": "mcsim.Moments",
+    "differencing": "an imbalance and a number of iterations",
+    "moved": "theta, phi and psi of each sample",
+    "lags": "pairs of weight and delay",
+}
+"""What a hook returns, in words."""
 
-_NUMBERS = {*_OF_THE_SHAPE_OF, "noise", "spread"}
+_OBJECTS = {"beam": Beam, "pointing": Beam, "orientations": Moments}
+_OPTIONAL = ("gain", "noise", "moved", "lags")  #: hooks that may return None
 
 
 class HookError(InputError):
-    """A hook of an effect that fails, or returns what is no number: never a reason to leave the effect out."""
+    """A hook of an effect that fails, or returns what it should not: never a reason to leave the effect out."""
 
 
 def guard(kind: type) -> None:
-    """Let the hooks that a class defines say in a sentence if they fail, or return what is no number."""
+    """Let the hooks that a class defines say in a sentence if they fail, or return what they should not."""
     for hook in HOOKS:
         if hook in vars(kind):
             setattr(kind, hook, _guarded(hook, vars(kind)[hook]))
@@ -36,19 +52,44 @@ def _guarded(hook: str, function: Callable[..., Any]) -> Callable[..., Any]:
         what = f"effect {effect.name}: its {hook}"
         try:
             found = function(effect, *given, **named)
-            values = np.asarray(0.0 if found is None or hook not in _NUMBERS else found)
-            finite = bool(np.all(np.isfinite(values)))
+            flaw = _flaw(hook, found, (*given, *named.values()))
         except InputError:
             raise
         except Exception as error:  # whatever a user's code does
             raise HookError(f"{what} fails ({type(error).__name__}: {error}); mend it.") from error
-        if not finite:
-            raise HookError(f"{what} returns values that are not finite; let it return numbers.")
-        if hook in _OF_THE_SHAPE_OF and found is not None and given and values.shape != np.shape(given[0]):
-            raise HookError(
-                f"{what} returns an array of shape {values.shape} where {_OF_THE_SHAPE_OF[hook]} have "
-                f"{np.shape(given[0])}; let it return one value for each."
-            )
+        if flaw is not None:
+            raise HookError(f"{what} returns {flaw}; let it return {_RETURNED[hook]}.")
         return found
 
     return call
+
+
+def _flaw(hook: str, found: Any, given: Sequence[Any]) -> str | None:
+    """Say what a hook returns that it should not; None: nothing."""
+    if found is None:
+        return None if hook in _OPTIONAL else "None"
+    if hook in _OBJECTS:
+        return None if isinstance(found, _OBJECTS[hook]) else f"a {type(found).__name__}"
+    values = np.asarray(found)
+    if not np.all(np.isfinite(values)):
+        return "values that are not finite"
+    wanted = _shape(hook, values, given)
+    if values.shape != wanted:
+        return f"an array of shape {values.shape}, where {wanted} is needed"
+    return f"values of type {values.dtype}" if np.iscomplexobj(values) != (hook == "sky") else None
+
+
+def _shape(hook: str, values: np.ndarray, given: Sequence[Any]) -> tuple[int, ...]:
+    """Return the shape that numbers from a hook should have."""
+    match hook:
+        case "noise":
+            return (12 * given[0].nside ** 2,)
+        case "spread":
+            return ()
+        case "differencing":
+            return (2,)
+        case "lags":
+            return (*values.shape[:1], 2)
+        case "moved":
+            return (3, *np.shape(given[0]))
+    return np.shape(given[0])

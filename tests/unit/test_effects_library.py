@@ -296,6 +296,33 @@ def test_a_hook_that_fails_says_which(gain, named, site):
         whole(gain=gain)(amplitude=1.0).gain(np.zeros(5), site)
 
 
+@pytest.mark.parametrize(
+    ("hook", "returned", "named"),
+    [
+        ("sky", None, ("None", "coefficient")),
+        ("sky", np.zeros(5), ("float64", "complex")),
+        ("beam", None, ("None", "mcsim.Beam")),
+        ("pointing", np.zeros((1, 5), dtype=complex), ("ndarray", "mcsim.Beam")),
+        ("gain", np.zeros(5, dtype=complex), ("complex128", "real")),
+        ("signal", None, ("None", "times")),
+        ("noise", np.ones(3), ("(3,)", "(768,)")),
+        ("noise", 1.1, ("()", "(768,)")),
+        ("excess", None, ("None", "counts")),
+        ("spread", None, ("None", "number")),
+        ("orientations", None, ("None", "mcsim.Moments")),
+        ("differencing", None, ("None", "imbalance")),
+        ("moved", (np.zeros(5), np.zeros(5)), ("(2, 5)", "(3, 5)")),
+        ("lags", 3.0, ("()", "delay")),
+    ],
+)
+def test_a_hook_that_returns_something_else_says_which(hook, returned, named, site):
+    """A return that is forgotten first of all: what is None would fail far from the effect."""
+    effect = whole(**{hook: lambda self, *given: returned})(amplitude=1.0)
+    given = site if hook == "noise" else np.zeros(5)
+    with refused("foreign", hook, *named):
+        getattr(effect, hook)(given)
+
+
 def test_effects_of_one_name_draw_apart(site):
     once = systematics.build("point_sources", {"amplitude": 1.0})
     sky = np.zeros(alm_.size(LMAX), dtype=complex)
