@@ -20,6 +20,7 @@ from mcsim.datavector.wiener_filter import Model, model_of, shared_sky, wiener_f
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError
 from mcsim.simulation import differencing, sampled, simulate
+from mcsim.simulation.channels import refuse_unseen
 from mcsim.simulation.nuisance import DisturbedSurvey, Nuisance, check_nuisances, nuisances_of
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
@@ -210,6 +211,7 @@ def _hindrance(model: Model, kind: type[Effect], channel: str | None, settings: 
         for owner in owners:
             systematics.tried((effect,), replace(owner.site, lmax=model.lmax))
             effect.orientations(owner.maps[0].moments, owner.site)
+            refuse_unseen(owner.name, (effect,))
     except systematics.HookError:
         raise
     except InputError as error:

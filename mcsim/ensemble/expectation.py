@@ -25,6 +25,7 @@ from mcsim.config import preparation as declared
 from mcsim.errors import InputError
 from mcsim.simulation import convolve
 from mcsim.simulation import survey as survey_
+from mcsim.simulation.channels import refuse_unseen
 from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
@@ -97,6 +98,7 @@ def nearer(survey: Survey, channel: Channel) -> NDArray[np.float64]:
 
 def _check_covered(channel: Channel) -> None:
     """Raise InputError for an effect that changes more than the beam, its orientations and the noise."""
+    refuse_unseen(channel.name, channel.effects)
     for effect in channel.effects:
         changed = [hook for hook in _LEFT_OUT if systematics.acts_through(effect, hook)]
         if effect.amplitude != 0.0 and changed:

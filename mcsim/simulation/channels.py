@@ -241,6 +241,17 @@ def refuse_differences(channel: str, acting: tuple[systematics.Effect, ...]) -> 
             )
 
 
+def refuse_unseen(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
+    """Refuse effects that say what single samples see, and nothing else, for maps that are not made of samples."""
+    for effect in acting:
+        alone = systematics.acts_through(effect, "moved", "lags") and not systematics.acts_through(effect, "pointing")
+        if effect.amplitude != 0.0 and alone:
+            raise InputError(
+                f"effect {effect.name} on channel {channel} acts on single samples by moved or lags, and has no hook "
+                "pointing, by which maps of the default route have it; define that too, or simulate sample by sample."
+            )
+
+
 def with_offsets(moments: scan.Moments, order: int, spec: config.Channel) -> scan.Moments:
     """Return moments with those of the samples' offsets that a run asks for, and no others.
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mcsim import bipolar, systematics
 from mcsim.simulation import convolve, differencing, rings, skies
+from mcsim.simulation.channels import refuse_unseen
 from mcsim.simulation.offsets import Expansion, expansion, offset_maps
 from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
@@ -293,6 +294,7 @@ def _observe_on_rings(
 
 def _seen(survey: Survey, channel: Channel, sky: Alm, realization: int) -> tuple[Alm, Alm | None]:
     """Return the sky that the channel looks at, and the dipole in it that is taken off again, None if there is none."""
+    refuse_unseen(channel.name, channel.effects)
     sky = systematics.looked_at(channel.effects, sky, channel.site, survey.config.ensemble.seed, realization)
     if not channel.effects or not channel.site.dipole_uk.any():
         return sky, None

@@ -1,5 +1,6 @@
 """Each effect in the default route against the survey made sample by sample: shape and amplitude of its response."""
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -8,8 +9,11 @@ import numpy as np
 import pytest
 
 from mcsim import config, systematics
+from mcsim.datavector.analysis import analysis_of, check_asked
+from mcsim.ensemble import expectation
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import Survey, survey
+from out_of_library import Crosstalk
 from refusals import refused
 
 NSIDE = 16
@@ -164,3 +168,21 @@ def test_what_samples_cannot_do_is_refused():
     changed = prepared("orientation_averaging", amplitude=0.0)
     with refused("orientation_averaging", "W1"):
         sampled.maps(changed, 0)
+
+
+def test_what_only_samples_can_do_is_refused():
+    """An effect without ``pointing`` would be in the maps of one route, and not in those of the other."""
+    without = prepared()
+    acting = config.Effect(name="invented_crosstalk", channel="W1", parameters={"amplitude": 0.02})
+    run, library = replace(without.config, effects=(acting,)), {"invented_crosstalk": Crosstalk}
+    changed = survey(run, library=library)
+    assert np.std(sampled.maps(changed, 0)[0][1] - plain()[1]) > 0.1
+    for made in (simulate.maps, simulate.realize):
+        with refused("invented_crosstalk", "W1", "pointing"):
+            made(changed, 0)
+    with refused("invented_crosstalk", "pointing"):
+        expectation.scanned_beams(changed, 2)
+    analysis = analysis_of(prepared(sigma0_uk=1.0).config, library=library)
+    assert not analysis.candidates
+    with refused("invented_crosstalk", "pointing"):
+        check_asked(analysis, ["invented_crosstalk"])
