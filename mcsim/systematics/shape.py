@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.beams.coefficients import unpacked
+from mcsim.sphere import alm as alm_
 
 Blm = NDArray[np.complex128]
 Values = NDArray[np.float64]
@@ -20,6 +21,7 @@ NEGLECTED = 1e-8  #: largest fraction of a beam's power that is cut off beyond m
 _TAIL = 1e-12
 _HIGHEST = 20000
 _FITTED = 0.6
+_FAR = 40.0  #: lmax times an angle from which on a series of turns takes longer than a rotation of all orders
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,9 +161,14 @@ def displaced(beam: Beam, angle: float, distance: float) -> Beam:
     -----
     exp(-i distance k.J) b with the axis k = (-sin angle, cos angle, 0): J is tridiagonal in m, so the series costs
     a few sums over a band of orders at every degree, and no transform. Steps of at most 1/2 in l times distance keep
-    the series from losing digits.
+    the series from losing digits. Beyond _FAR, where they are many, ducc0 rotates all orders.
     """
     reach = beam.lmax * abs(distance)
+    if reach > _FAR:
+        every = np.zeros(alm_.size(beam.lmax), dtype=np.complex128)
+        every[: beam.packed().size] = beam.packed()
+        turned = ducc0.sht.rotate_alm(every, beam.lmax, -angle, distance, angle, nthreads=1)
+        return trimmed(unpacked(turned, beam.lmax, beam.lmax), beam, 1)
     steps = max(1, int(np.ceil(2.0 * reach)))
     full = _both_signs(beam, beam.mmax + 16 + int(np.ceil(1.5 * reach)))
     axis = (-np.sin(angle), np.cos(angle))

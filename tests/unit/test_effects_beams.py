@@ -155,6 +155,18 @@ def test_displaced_beam_is_a_rotated_one():
     assert found.neglected_power <= 1e-8 + ellipse.neglected_power
 
 
+def test_a_beam_is_displaced_far_at_once():
+    """By a quarter of a circle at many degrees, where turning it little by little would take hours."""
+    lmax, distance, angle = 512, np.deg2rad(90.0), np.deg2rad(-130.0)
+    beam = Beam.gaussian(60.0, lmax)
+    found = displaced(beam, angle, distance)
+    ell, m = np.arange(lmax + 1)[None, :], np.arange(found.mmax + 1)[:, None]
+    harmonics = np.where(m <= ell, sph_harm_y(ell, m, distance, angle), 0.0)
+    expected = np.sqrt(4 * np.pi / (2 * ell + 1)) * beam.blm[0] * harmonics.conj()
+    np.testing.assert_allclose(found.blm, expected, rtol=0.0, atol=1e-12)
+    assert found.neglected_power <= 1e-8
+
+
 def test_smeared_beam_is_filtered_in_the_spin_frame():
     """e_phi is the direction of motion, beam x: from the pole to the circle by R_y(boresight) R_z(90 deg)."""
     lmax, boresight, lag = 192, np.deg2rad(70.5), 0.004
