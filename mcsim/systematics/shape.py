@@ -9,6 +9,7 @@ import ducc0
 import numpy as np
 from numpy.typing import NDArray
 
+from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.beams.coefficients import unpacked
 from mcsim.sphere import alm as alm_
@@ -19,7 +20,7 @@ Values = NDArray[np.float64]
 NEGLECTED = 1e-8  #: largest fraction of a beam's power that is cut off beyond m_max when an effect is done with it
 
 _TAIL = 1e-12
-_HIGHEST = 20000
+_HIGHEST = 65536
 _FITTED = 0.6
 _FAR = 40.0  #: lmax times an angle from which on a series of turns takes longer than a rotation of all orders
 
@@ -111,6 +112,7 @@ def extended(beam: Beam) -> Beam:
     over the upper part of the degrees: exact for a circular Gaussian. Beyond lmax a beam is a guess, of which
     the effects' coefficients at l <= lmax feel only what is within about 1 / sigma of lmax. A beam whose window is not
     positive and falling there is left as it is: real beam maps have fallen to the noise of their wings by then.
+    InputError for one that would end in a step all the same, at the highest degree that values are computed of.
     """
     window, lmax = beam.window, beam.lmax
     first = min(int(_FITTED * lmax), max(lmax - 8, 0))
@@ -130,7 +132,13 @@ def extended(beam: Beam) -> Beam:
     x_beyond = ell * (ell + 1.0) / (lmax * (lmax + 1.0))
     exponent = logarithm(x_beyond) - np.log(window[0])
     gone = np.nonzero(exponent < np.log(_TAIL))[0]
-    size = int(gone[0]) + 1 if gone.size else len(ell)
+    if not gone.size:
+        raise InputError(
+            f"an effect on its shape needs a beam of which nothing is left at l = {_HIGHEST}, which a FWHM above 0.93 "
+            f"arcmin makes sure of; this one falls too slowly at its lmax = {lmax}. Leave the effect out, or raise "
+            "sky.lmax if the beam is wider."
+        )
+    size = int(gone[0]) + 1
     beyond = window[0] * np.exp(exponent[:size])
     blm = np.zeros((beam.mmax + 1, lmax + 1 + size), dtype=np.complex128)
     blm[:, : lmax + 1] = beam.blm

@@ -266,6 +266,21 @@ def test_responses_are_linear_at_the_step(name):
         assert np.linalg.norm(whole + opposite) < 0.04 * np.linalg.norm(whole)
 
 
+def test_a_narrow_beam_is_continued_to_its_end():
+    """In the plane u^3 - 3u of a Gaussian has 3/8 and 1/8 of k (l sigma)^3 at the orders 1 and 3."""
+    lmax, k, fwhm = 1024, 0.02, 1.4
+    beam = Beam.gaussian(fwhm, lmax)
+    ell = np.array([256, 1024])
+    cube = k * (ell * np.deg2rad(fwhm / 60.0) / np.sqrt(8.0 * np.log(2.0))) ** 3
+    coma = systematics.get("beam_coma")(amplitude=k).beam(beam, site_of(beam)).blm[:, ell]
+    np.testing.assert_allclose(np.abs(coma[[1, 3]] / coma[0]), [3.0 / 8.0 * cube, cube / 8.0], rtol=0.02)
+    wide = systematics.get("beam_width")(amplitude=0.1).beam(beam, site_of(beam))
+    np.testing.assert_allclose(wide.window, Beam.gaussian(1.1 * fwhm, lmax).window, rtol=0.0, atol=1e-10)
+    narrower = Beam.gaussian(0.5, lmax)
+    with refused(str(lmax), "sky.lmax"):
+        systematics.get("beam_coma")(amplitude=k).beam(narrower, site_of(narrower))
+
+
 def test_beams_without_a_falling_window_are_left_alone():
     beam = Beam.gaussian(FWHM, 192)
     blm = beam.blm.copy()
