@@ -185,6 +185,10 @@ class BeamComa(Effect):
     which would stretch u as well. The change is
     k sigma^-3 times c1 cos a + s1 sin a + c3 cos 3a + s3 sin 3a in the angle a, whatever the beam: m = 1 goes with the
     angle and m = 3 with three times it, so that four components span it.
+
+    A beam that sky.lmax does not resolve is continued as a Gaussian goes on. Sigma and the change of a measured one are
+    a guess then: those of WMAP's W1 are 13.2', 8.6' and 6.1' at lmax 64, 292 and 1500, and the change of b_l1 at l = 60
+    has either sign. Where k is to mean the same, raise sky.lmax until the beam has fallen.
     """
 
     name = "beam_coma"
@@ -246,7 +250,8 @@ class BeamSidelobe(Effect):
 
     Notes
     -----
-    It acts after all other effects on the shape, which are of the main beam: a coma would amplify the ring.
+    It acts after all other effects on the shape, which are of the main beam: a coma would amplify the ring. Of a
+    measured beam that sky.lmax does not resolve, sigma and peak are as uncertain as for ``beam_coma``.
     """
 
     name = "beam_sidelobe"
