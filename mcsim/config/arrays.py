@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError, RunError
-from mcsim.support import folders
+from mcsim.support import folders, resources
 from mcsim.support.arrays import numbers
 from mcsim.support.npy import write_npy
 
@@ -50,6 +50,8 @@ RULES = {
     "noise.mask": Rule(placeholders=("channel",)),
     "noise.files": Rule(placeholders=("channel", "split", "realization")),
     "effect.template": Rule(),
+    # The name of a packaged one stands for it in hashes of runs, as it always did.
+    "effect orientation_averaging.model": Rule("scan_models", words=resources.names("scan_models")),
     "ensemble.maps": Rule(placeholders=("realization", "channel", "split"), checked=False),
     "preparation.mask": Rule(placeholders=("channel", "split")),
     "preparation.window": Rule(placeholders=("channel",)),

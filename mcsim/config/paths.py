@@ -61,9 +61,12 @@ def entries(plain: dict[str, Any]) -> Iterator[Entry]:
         of_splits = table.get("split_noise")
         for split, own in of_splits.items() if isinstance(of_splits, dict) else ():
             sections.append(("noise", f"{key}.split_noise.{split}", own, one, split))
-    sections += [("effect", f"effect[{n}]", table, every, None) for n, table in enumerate(_tables(plain, "effect"))]
-    given = enumerate(_tables(plain, "nuisance"))
-    sections += [("effect", f"nuisance[{n}].parameters", table.get("parameters"), every, None) for n, table in given]
+    for n, table in enumerate(_tables(plain, "effect")):
+        of_effects = ("effect", f"effect {table.get('name')}")
+        sections += [(section, f"effect[{n}]", table, every, None) for section in of_effects]
+    for n, table in enumerate(_tables(plain, "nuisance")):
+        of_effects, own = ("effect", f"effect {table.get('effect')}"), table.get("parameters")
+        sections += [(section, f"nuisance[{n}].parameters", own, every, None) for section in of_effects]
     for number, table in enumerate(_tables(plain, "preparation")):
         own = table.get("channels")
         names = tuple(map(str, own)) if isinstance(own, list) and own else every

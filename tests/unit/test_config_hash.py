@@ -6,6 +6,7 @@ import pytest
 
 from mcsim import config
 from mcsim.support import resources
+from refusals import refused
 
 from .conftest import DIFFERENCING, changed
 
@@ -119,6 +120,29 @@ def test_hash_covers_contents_of_files_and_not_their_place(plain, folder):
     assert config.digest(config.load(changed(plain, "sky.spectrum", "cl.txt"))) == digest
     Path("scan.toml").write_text("other contents")
     assert config.digest(config.load(plain)) != digest
+
+
+@pytest.mark.parametrize("key", ["effect", "nuisance"])
+def test_hash_covers_the_scan_model_that_an_effect_names(plain, folder, key):
+    """A path from the folder of the run; a packaged model is its name, as in the hashes of earlier versions."""
+    (folder / "real.toml").write_text("contents")
+
+    def science(model):
+        own = {"name": "orientation_averaging", "channel": "W1", "amplitude": 1.0, "model": model}
+        if key == "nuisance":
+            own = {"effect": own["name"], "channel": "W1", "width": 0.1, "parameters": {"model": model}}
+        run = config.load({**plain, key: [own]}, base=folder)
+        found = config.science(run, "nuisance")[key][0]
+        return run, found.get("parameters", found)["model"]
+
+    run, before = science("real.toml")
+    assert before.startswith("sha256:")
+    assert str(folder / "real.toml") in config.to_json(run)
+    (folder / "real.toml").write_text("other contents")
+    assert science("real.toml")[1] != before
+    assert science("wmap")[1] == "wmap"
+    with refused("real.tom", "planck"):
+        science("real.tom")
 
 
 def test_hash_covers_every_file_of_a_template(plain, folder):
