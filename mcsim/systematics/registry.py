@@ -96,9 +96,10 @@ def _flaw(kind: type[Effect]) -> str | None:
     for key, value, largest in (("step", step, float_info.max), ("max_amplitude", fit.max_amplitude, inf)):
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= largest:
             return f"has {key} = {value!r}: it needs a number above 0"
+    bounded = {f.name for f in fields(kind) if isinstance(f.default, int | float)}
     for one in kind.bounds:
-        if not isinstance(one, Bound) or one.parameter not in {f.name for f in fields(kind)} or not one.low < one.high:
-            return f"has the bound {one!r}: it needs a mcsim.systematics.Bound of a parameter, low < high"
+        if not isinstance(one, Bound) or one.parameter not in bounded or not one.low < one.high:
+            return f"has the bound {one!r}: it needs a mcsim.systematics.Bound of a parameter, a number, low < high"
     if fit.sign not in (-1, 0, 1):
         return f"has sign = {fit.sign!r}: it needs -1, 0 or 1"
     try:
@@ -152,6 +153,8 @@ def in_file(path: str) -> tuple[type[Effect], ...]:
     file = Path(path).absolute()
     if not file.is_file():
         raise InputError(f"{path} is no file; name a Python file that defines a class derived from mcsim.Effect.")
+    if "." in file.stem:
+        raise InputError(f"{path} has a dot before that of .py, as no module has it in its name; rename it.")
     content = file.read_bytes()
     before = sys.modules.get(file.stem)
     if before is not None and _path_of(before) == file:

@@ -266,6 +266,10 @@ def test_an_effect_that_says_itself_how_it_is_fitted_is_refused(key):
         (whole(parametrization=Parametrization(max_amplitude=-1.0)), "max_amplitude"),
         (whole(parametrization=1.0), "parametrization"),
         (whole(variants=({"no_such": 1.0},)), "no_such"),
+        (
+            whole(bounds=(systematics.Bound("band", 0.0, 1.0, "a test"),), band="V", __annotations__={"band": str}),
+            "band",
+        ),
         (whole(parametrization=Angle(parameter="no_such")), "no_such"),
         (whole(parametrization=Doubled()), "coordinates"),
         (whole(spread=None), "orientations"),
@@ -364,9 +368,10 @@ def test_a_file_that_is_mended_is_run_anew(tmp_path, monkeypatch):
     assert systematics.get(str(path)).unit == "uK"
 
 
-def test_a_file_named_like_a_module_of_python_is_refused(tmp_path, monkeypatch):
+def test_a_file_named_like_a_module_of_python_or_no_module_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.path", list(sys.path))
     monkeypatch.setenv("PYTHONPATH", "")
-    (tmp_path / "time.py").write_text("x = 1\n")
-    with refused(str(tmp_path / "time.py")):
-        systematics.get(str(tmp_path / "time.py"))
+    for name in ("time.py", "of.two.py"):
+        (tmp_path / name).write_text("x = 1\n")
+        with refused(str(tmp_path / name), "rename"):
+            systematics.get(str(tmp_path / name))
