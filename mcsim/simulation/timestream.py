@@ -28,7 +28,7 @@ from mcsim.support.arrays import Map, divided
 from mcsim.support.code import package_digest
 from mcsim.support.npy import write_npy
 
-SECONDS_PER_SAMPLE = 1.2e-7
+SECONDS_PER_SAMPLE = 8e-8
 """Time of one core for a sample of correlated noise: pointing, random numbers, filter, sums."""
 
 TOLERANCE, ITERATIONS = 1e-10, 2000  #: of the offsets: relative residual of the conjugate gradients
@@ -204,7 +204,7 @@ def _timed(
     if of.rings is not None:
         stages.append(tod.every_ring(of.model.spin_period_s, *of.rings))
     start = of.grid.sample_range(of.model, line)[0] * of.model.period_of_samples(line)
-    for chunk in tod.through(tod.samples(of.model, line, of.grid), stages):
+    for chunk in tod.through(tod.samples(of.model, line, of.grid, angles=False), stages):
         if chunk.time_s.size:
             yield chunk, np.floor((chunk.time_s - start) / _baseline_s(of)).astype(np.int64)
 
