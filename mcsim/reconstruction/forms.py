@@ -230,7 +230,7 @@ class InTime(Form):
         if len(set(self.splits)) == 1:
             return np.full(len(time_s), self.splits[0])
         model, number = site.pointed(self.name).model, len(self.splits)
-        part_s = model.spin_period_s if self.by_rings else model.duration_days * SECONDS_PER_DAY / number
+        part_s = abs(model.spin_period_s) if self.by_rings else model.duration_days * SECONDS_PER_DAY / number
         place = np.floor(np.asarray(time_s) / part_s).astype(int)
         return np.array(self.splits)[place % number if self.by_rings else np.clip(place, 0, number - 1)]
 

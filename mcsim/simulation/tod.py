@@ -193,7 +193,7 @@ def every_ring(spin_period_s: float, number: int, index: int) -> Stage:
 
 def on_rings(time_s: NDArray[np.float64], spin_period_s: float, number: int, index: int) -> NDArray[np.bool_]:
     """Return True for samples of every ``number``-th ring from ring ``index`` on."""
-    return np.asarray(np.floor(time_s / spin_period_s).astype(np.int64) % number == index)
+    return np.asarray(np.floor(time_s / abs(spin_period_s)).astype(np.int64) % number == index)
 
 
 def check_noise(sigma0_uk: float) -> None:

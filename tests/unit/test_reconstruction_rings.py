@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import lru_cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ from mcsim import config
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import Model, model_of, wiener_filter
 from mcsim.reconstruction import simulated_scores
+from mcsim.reconstruction.forms import InTime
 from mcsim.reconstruction.grammar import structures
 from mcsim.reconstruction.plugin import plugin
 from mcsim.reconstruction.scores import Scene
 from mcsim.reconstruction.structure import ALIKE, OPPOSITE
-from mcsim.simulation import simulate
+from mcsim.simulation import simulate, tod
 from mcsim.simulation.survey import survey
 
 NSIDE, PERIOD = 16, "period 5640.0"
@@ -91,3 +93,12 @@ def test_rings_of_splits_are_apart_and_sets_have_no_time_line():
     assert one.mean() > 0.4
     assert other.mean() > 0.4
     assert simulated_scores.scene_of(model("sets")).time_lines == ()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_factor_of_rings_is_that_of_the_samples_in_them(sign):
+    time_s = np.arange(0.0, 1000.0, 7.0)
+    form = SimpleNamespace(name="alternating", splits=(1.0, -0.5), by_rings=True)
+    site = SimpleNamespace(pointed=lambda _: SimpleNamespace(model=SimpleNamespace(spin_period_s=sign * 129.3)))
+    assert np.array_equal(InTime.factor(form, time_s, site) == 1.0, tod.on_rings(time_s, sign * 129.3, 2, 0))
+    assert InTime.factor(form, time_s, site)[0] == 1.0

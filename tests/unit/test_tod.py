@@ -185,6 +185,13 @@ def test_bad_grids_are_named(changes, named):
         tod.observe(MODEL, LINE, MapGrid(**({"nside": NSIDE} | changes)), [])
 
 
+@pytest.mark.parametrize("spin_period_s", [10.0, -10.0])
+def test_rings_follow_each_other_in_time_whichever_way_the_survey_spins(spin_period_s):
+    time_s = np.arange(60.0)
+    for index in range(3):
+        assert np.array_equal(tod.on_rings(time_s, spin_period_s, 3, index), time_s // 10 % 3 == index)
+
+
 @pytest.mark.parametrize(
     ("changes", "named"),
     [({"lmax": 30}, ("lmax", 30, "(861,)", "(496,)")), ({"beam": Beam.gaussian(900.0, 20)}, ("l = 20", "lmax", 40))],
