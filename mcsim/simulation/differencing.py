@@ -168,7 +168,7 @@ def _rhs(
     removed = None
     if dipole is not None:
         fiducial = [
-            convolve.response(b, channel.site.lmax, channel.window) for b in (channel.site.beam, side_b.fiducial)
+            convolve.response(b, channel.site.lmax, channel.seen_window) for b in (channel.site.beam, side_b.fiducial)
         ]
         dipole_a, dipole_b = (mapmaking.side_maps(dipole, response, nside, nthreads) for response in fiducial)
         removed = [(dipole_a, dipole_b)]

@@ -273,8 +273,7 @@ def _circular(channel: Channel, seen: Alm, dipole: Alm | None) -> Alm:
 
 def _fiducial_response(channel: Channel) -> convolve.Response:
     """Return the response to the dipole that is taken off: the fiducial beam, at the samples' own places."""
-    spread = systematics.spread_of(channel.effects)
-    return convolve.response(channel.site.beam, channel.site.lmax, channel.window ** (spread * spread))
+    return convolve.response(channel.site.beam, channel.site.lmax, channel.seen_window)
 
 
 def _observe_on_rings(

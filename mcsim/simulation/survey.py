@@ -116,6 +116,12 @@ class Channel:
     #: the grid, where it is one of rings instead of pixels; the moments of the map then mean nothing and are NaN
     rings: tuple[Rings, ...] | None = None
 
+    @property
+    def seen_window(self) -> NDArray[np.float64]:
+        """Pixel window of samples where effects leave them: it is a Gaussian in all but name, (lmax + 1,)."""
+        spread = spread_of(self.effects)
+        return np.asarray(self.window ** (spread * spread))
+
 
 @dataclass(frozen=True)
 class Survey:

@@ -85,6 +85,16 @@ def test_imbalance_leaves_what_dense_map_making_leaves_of_the_dipole():
         np.testing.assert_allclose(found, expected - expected.mean(), atol=1e-5 * expected.std())
 
 
+@pytest.mark.parametrize("kind", ["differencing", "hit_averaged"])
+def test_samples_nearer_to_the_centres_of_pixels_leave_nothing_of_the_dipole(kind):
+    """It is taken off where the samples are: some uK were left where its pixel window was that of others."""
+    scan = {"kind": kind, "model": "wmap_focal_plane", "sample_period_s": 631.2}
+    run = run_of([effect("pixelization", -1.0)], scan=scan | ({"pair": "W1"} if kind == "differencing" else {}))
+    without = replace(run, sky=replace(run.sky, dipole_uk=0.0))
+    found, expected = (simulate.maps(survey(one), 0) for one in (run, without))
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
 def test_a_template_is_the_finite_difference_of_the_chain():
     """The imbalance of skies without CMB is that of the dipole; the matched filter's template is that per step."""
     step = 1e-3
