@@ -14,7 +14,16 @@ from mcsim.config.messages import standing
 from mcsim.errors import InputError
 from mcsim.simulation import convolve
 from mcsim.simulation.channels import check_scope, site_of, table_of
-from mcsim.simulation.pixel_means import Part, gain_of, gain_of_all, mean_gain, mean_signal, signal_of
+from mcsim.simulation.pixel_means import (
+    Part,
+    drifts,
+    gain_of,
+    gain_of_all,
+    is_linear,
+    mean_gain,
+    mean_signal,
+    signal_of,
+)
 from mcsim.simulation.survey import Channel, Survey, survey, with_effects
 from mcsim.sphere import rng
 from mcsim.support.arrays import Vector
@@ -236,7 +245,11 @@ class DisturbedSurvey:
             beam = beam.truncated(min(beam.mmax, *(m.moments.smax for m in channel.maps)))
             response = convolve.response(beam, site.lmax, channel.window ** (spread_of(acting) ** 2))
         moved = spread_of(acting) != 1.0  # signals of a direction are then not linear in coordinates
-        bent = tuple(effect for one, effect in drawn if one.parameter_widths and one.channel in (None, channel.name))
+        bent = tuple(
+            effect
+            for number, (one, effect) in enumerate(drawn)
+            if number in self._bent and one.channel in (None, channel.name)
+        )
         maps = []
         for place, m in enumerate(channel.maps):
             part = Part.of(self.survey.config, place)
@@ -270,21 +283,38 @@ class DisturbedSurvey:
         return found
 
     @cached_property
+    def _bent(self) -> frozenset[int]:
+        """Return the nuisances whose gain or signal is not linear in what is drawn: they take a pass for every draw."""
+        part = Part.of(self.survey.config, 0)
+        sites = [channel.site for channel in self.survey.making.channels]
+        return frozenset(
+            number
+            for number, one in enumerate(self.nuisances)
+            if one.parameter_widths
+            or not all(
+                is_linear(one.at(np.array(one.widths)), site, part)
+                for site in sites
+                if one.channel in (None, site.channel)
+            )
+        )
+
+    @cached_property
     def _means(self) -> dict[tuple[int, str, str], list[NDArray]]:
         """Return the mean errors of the gain, and signals, per coordinate: linear in these, they take a pass each.
 
-        Those of a nuisance with further parameters that are drawn are not linear, and take a pass for every draw.
         By nuisance, channel, and name in a map: one array for each map of the channel, shape (k, npix), of the gain
         (k, orders + 2, npix).
         """
         found = {}
-        linear = [(number, one) for number, one in enumerate(self.nuisances) if not one.parameter_widths]
+        linear = [(number, one) for number, one in enumerate(self.nuisances) if number not in self._bent]
         for (number, one), channel in product(linear, self.survey.making.channels):
             of_orders = partial(gain_of, orders=self._orders(channel))
             for hook, mean in (("gain", of_orders), ("signal", signal_of)):
                 if not acts_through(one.effect, hook) or one.channel not in (None, channel.name):
                     continue
                 basis = basis_of(one.effect, one.settings)
+                if hook == "gain" and not any(drifts(effect, channel.site) for effect in basis):
+                    continue
                 parts = [Part.of(self.survey.config, n) for n in range(len(channel.maps))]
                 found[number, channel.name, hook] = [
                     np.stack([mean(effect, channel.site, part) / effect.amplitude for effect in basis])

@@ -51,7 +51,7 @@ def mean_gain(acting: tuple[Effect, ...], site: Site, part: Part, orders: int = 
     relative error of the gain, d the offset from the pixel's centre as :class:`mcsim.instrument.scan.Moments` has it.
     None: no error. A pixel that none of a part's rings crosses has the means of all rings.
     """
-    drifting = [effect for effect in acting if effect.gain(np.zeros(1), site) is not None]
+    drifting = [effect for effect in acting if drifts(effect, site)]
     if not drifting:
         return None
 
@@ -134,7 +134,7 @@ def gain_of_all(acting: tuple[Effect, ...], site: Site, part: Part, orders: int 
 
     These are kept on disk: a diagnosis has the same effect at many amplitudes, and a pass can take minutes.
     """
-    drifting = [effect for effect in acting if effect.gain(np.zeros(1), site) is not None]
+    drifting = [effect for effect in acting if drifts(effect, site)]
     linear, others = _along_bases(drifting, partial(_gains, site=site, part=part))
     return _total(mean_gain(others, site, part, orders), linear, partial(gain_of, site=site, part=part, orders=orders))
 
@@ -145,6 +145,20 @@ def signal_of_all(acting: tuple[Effect, ...], site: Site, part: Part) -> Map | N
         return mean_signal(acting, site, part)
     linear, others = _along_bases(adding(acting), partial(_signals, site=site, part=part))
     return _total(mean_signal(others, site, part), linear, partial(signal_of, site=site, part=part))
+
+
+def is_linear(effect: Effect, site: Site, part: Part) -> bool:
+    """Return True if gain and signal of an effect are the sums of those of its basis, at some samples."""
+    for acts, values in ((drifts(effect, site), _gains), (bool(adding([effect])), _signals)):
+        seen = partial(values, site=site, part=part)
+        if acts and seen(effect).any() and _along_bases([effect], seen)[1]:
+            return False
+    return True
+
+
+def drifts(effect: Effect, site: Site) -> bool:
+    """Return True if an effect makes the gain err."""
+    return effect.gain(np.zeros(1), site) is not None
 
 
 def _total(found: NDArray | None, terms: Terms, mean: Callable[[Effect], NDArray]) -> NDArray | None:
