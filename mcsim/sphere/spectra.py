@@ -22,9 +22,11 @@ _NAMES_OF_D_L = re.compile(
 )
 _NAMES_OF_C_L = re.compile(r"(?i)(?<![a-z])C_?[\{(]?\\?(l|ell)(?=TT|[^a-z]|$)")
 
+DEGREES = ("l", "ell", "multipole")  #: names of columns of ell in FITS tables
+
 _TO_UK2 = {"uk2": 1.0, "muk2": 1.0, "microk2": 1.0, "mk2": 1e6, "k2": 1e12}
 _UNIT = re.compile(
-    r"(?i)(?<![a-z])(micro|mu|[muµμ])?K([_\s{]*(CMB|thermo\w*|RJ|ant\w*)\}?)?(\s*(\^|\*\*)\s*\{?2\}?|2|²)(?![\w.])"
+    r"(?i)(?<![a-z])(micro|mu|[muµμ])?\s*K([_\s{]*(CMB|thermo\w*|RJ|ant\w*)\}?)?(\s*(\^|\*\*)\s*\{?2\}?|2|²)(?![\w.])"
 )
 
 SMALLEST_D_UK2, LARGEST_D_UK2 = 1e-6, 1e9
@@ -172,7 +174,7 @@ def _read_text(path: Path) -> tuple[NDArray[np.float64], str, bool]:
     """Read C_l in uK^2, the header lines, and True if they state a unit."""
     with unreadable(f"power spectrum {str(path)!r}", "text", "give a text table or a FITS file"):
         contents = path.read_bytes()
-        lines = (gzip.decompress(contents) if path.suffix == ".gz" else contents).decode().splitlines()
+        lines = (gzip.decompress(contents) if path.suffix == ".gz" else contents).decode("utf-8-sig").splitlines()
     found: dict[int, float] = {}
     header = ""
     for number, line in enumerate(lines, start=1):
@@ -220,8 +222,15 @@ def _read_fits(path: Path) -> tuple[NDArray[np.float64], str, bool]:
             for i in range(min(2, len(table.columns)))
         ]
     # If the first column counts up, it is ell and the second is C_l.
-    ell = columns[0]
-    counts = len(columns) == 2 and len(ell) > 3 and np.array_equal(ell, ell[0] + np.arange(len(ell))) and ell[0] >= 0
+    ell, called = columns[0], str(table.columns.names[0])
+    named = called.strip().lower() in DEGREES
+    few = 0 if named else 3
+    counts = len(columns) == 2 and len(ell) > few and np.array_equal(ell, ell[0] + np.arange(len(ell))) and ell[0] >= 0
+    if named and not counts:
+        raise InputError(
+            f"power spectrum {str(path)!r} has no C_l for every ell one by one beside its column {called}; give every "
+            "ell from 2 to its last one."
+        )
     column = 2 if counts else 1
     cl = columns[1] if counts else columns[0]
     if counts:

@@ -52,6 +52,12 @@ def test_text_table_with_monopole_and_dipole(tmp_path):
     np.testing.assert_array_equal(spectra.load(path, 2), [7.0, 8.0, 9.0])
 
 
+def test_text_with_a_mark_of_its_encoding(tmp_path):
+    path = tmp_path / "cl.txt"
+    path.write_text("2 1200\n3 557\n4 310.5\n", encoding="utf-8-sig")
+    np.testing.assert_array_equal(spectra.load(path, 4), CL)
+
+
 def test_compressed_text_table(tmp_path):
     path = tmp_path / "cl.txt.gz"
     path.write_bytes(gzip.compress(b"2 1200\n3 557\n4 310.5\n"))
@@ -164,6 +170,7 @@ def write_text(path, cl, header="", first=2):
         ("l, C_l (uK_{CMB}^2)", 1.0),
         ("l, C_l in uK thermodynamic**2", 1.0),
         ("l C_l / µK²", 1.0),
+        ("l C_l [\\mu K^2]", 1.0),
         ("ell C_ell [mK^2]", 1e6),
         ("ell, C_ell in K**2", 1e12),
     ],
@@ -237,6 +244,17 @@ def test_fits_with_a_column_of_ell(tmp_path):
         ]
         fits.BinTableHDU.from_columns(columns).writeto(path)
         np.testing.assert_allclose(spectra.load(path, 600), LCDM, rtol=1e-12)
+
+
+@pytest.mark.parametrize("rows", [[0, *range(2, 40)], range(39, -1, -1), range(2, 40, 2)], ids=["gap", "down", "even"])
+def test_a_column_of_ell_is_not_taken_for_the_spectrum(tmp_path, rows):
+    path = tmp_path / "cl.fits"
+    columns = [
+        fits.Column(name=name, format="D", array=values[list(rows)]) for name, values in (("Ell", ELL), ("TT", LCDM))
+    ]
+    fits.BinTableHDU.from_columns(columns).writeto(path)
+    with refused("cl.fits", "Ell"):
+        spectra.load(path, 15)
 
 
 def test_fits_that_starts_at_the_quadrupole(tmp_path):
