@@ -76,6 +76,8 @@ def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.f
     own derivatives.
     """
     check_alm(alm, lmax)
+    if lmax == 0:  # where there is no spin 1
+        return np.zeros((2, 12 * nside**2))
     ell = np.arange(lmax + 1.0)
     electric_magnetic = np.zeros((2, alm.size), dtype=np.complex128)
     electric_magnetic[0] = alm_.multiply(alm, np.sqrt(ell * (ell + 1.0)), lmax)

@@ -209,6 +209,13 @@ def test_pixels_without_hits_are_unseen(sky, beam) -> None:
     assert np.count_nonzero(found != healpy.UNSEEN) == 1
 
 
+def test_a_monopole_is_the_same_in_every_pixel() -> None:
+    moments = mcsim.Moments.from_model(mcsim.ScanModel.load("wmap").with_sampling(60.0), nside=8)
+    for window in (None, False):
+        found = mcsim.observe([10.0 + 0.0j], mcsim.Beam.elliptical(600.0, 400.0, lmax=8), moments, pixel_window=window)
+        np.testing.assert_allclose(found[moments.hits > 0], 10.0 / np.sqrt(4.0 * np.pi), rtol=1e-12)
+
+
 @pytest.mark.parametrize("wrong", ["short", "nan", "two", "beam", "moments"])
 def test_observe_checks_its_input(sky, beam, wrong) -> None:
     alm, moments = sky.copy(), Moments.parallel_transport(NSIDE, smax=beam.mmax)
