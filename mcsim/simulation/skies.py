@@ -24,20 +24,20 @@ SMALLEST_UK = 0.01
 def given(run: config.RunConfig, realization: int) -> Alm | None:
     """Return the sky of a realization that a run reads from files, a_lm up to the sky's lmax, uK; None: it draws it."""
     sky, frame = run.sky, run.map.frame
-    if sky.alm is not None:
-        return read_alm(config.sky_path(sky.alm, realization), sky.lmax, frame)
-    if sky.map is None:
-        return None
     channels = {channel.frequency_ghz for channel in run.channels}
     frequency = channels.pop() if len(channels) == 1 else None
+    if sky.alm is not None:
+        return read_alm(config.sky_path(sky.alm, realization), sky.lmax, frame, frequency_ghz=frequency)
+    if sky.map is None:
+        return None
     return read_map(config.sky_path(sky.map, realization), sky.lmax, frame, frequency_ghz=frequency)
 
 
-def read_alm(path: Path, lmax: int, frame: str) -> Alm:
+def read_alm(path: Path, lmax: int, frame: str, frequency_ghz: float | None = None) -> Alm:
     """Read the coefficients of a sky up to ``lmax``, uK, from a file of ``healpy.write_alm`` or ``numpy.save``.
 
-    InputError if the file cannot be read, ends below ``lmax``, states another frame or a unit that is no CMB
-    temperature, or has values that are not finite or of no sky in uK.
+    ``frequency_ghz`` is as in :func:`read_map`. InputError if the file cannot be read, ends below ``lmax``, states
+    another frame or a unit that cannot be converted, or has values that are not finite or of no sky in uK.
     """
     if path.suffix == ".npy":
         given = read_npy(path, "c")
@@ -54,7 +54,7 @@ def read_alm(path: Path, lmax: int, frame: str) -> Alm:
     stated = header.frame_named(keywords.get("COORDSYS"), str(path))
     if stated not in (None, frame):
         raise InputError(f"{path} is in {stated} coordinates, the run's maps in {frame}; rotate the sky first.")
-    factor = header.to_uk(str(keywords.get("TUNIT2", "")), path)
+    factor = header.to_uk(str(keywords.get("TUNIT2", "")), path, frequency_ghz)
     alm = alm if factor == 1.0 else factor * alm
     _check_size(path, alm)
     return alm_.resize(alm, found, lmax)

@@ -313,6 +313,8 @@ def test_sky_alm(tmp_path):
     np.testing.assert_array_equal(skies.read_alm(written(BIGGER), LMAX, "ecliptic"), alm_.resize(BIGGER, 24, LMAX))
     np.testing.assert_allclose(skies.read_alm(written(ALM, TUNIT2="mK"), LMAX, "ecliptic"), 1e3 * ALM)
     np.testing.assert_array_equal(skies.read_alm(written(0.0 * ALM), LMAX, "ecliptic"), 0.0 * ALM)
+    antenna = skies.read_alm(written(ALM, TUNIT2="uK_RJ"), LMAX, "ecliptic", frequency_ghz=94.0)
+    np.testing.assert_allclose(antenna, 1.25021 * ALM, rtol=1e-5)
     turned = np.where(np.arange(ALM.size) <= LMAX, 1j, 1.0) * ALM
     for alm, keywords, named in (
         (SMALLER, {}, ("l = 8", 16)),
