@@ -181,7 +181,7 @@ def _difference(
         hits = np.isfinite(maps).astype(np.float64)
     else:
         given = [config.channel_path(path, spec.name) for path in noise.hits] or paths
-        hits = np.stack([_positive(path, moments, healpix.HITS)[0] for path in given])
+        hits = np.stack([_positive(path, moments, healpix.HITS, bool(noise.hits))[0] for path in given])
     used = np.all(np.isfinite(maps) & (hits > 0.0), axis=0)
     if noise.mask is not None:
         mask = read_mask(config.channel_path(noise.mask, spec.name), moments.nside, moments.frame, run.map.mask_frame)
@@ -245,9 +245,12 @@ def _temperature(path: Path, moments: Moments, frequency_ghz: float | None) -> M
     return np.where(np.isfinite(values) & (values > UNSEEN_BELOW), values, np.nan)
 
 
-def _positive(path: Path, moments: Moments, names: Sequence[str]) -> tuple[Map, str | None]:
-    """Return a map of hits or variances, 0 where nothing was observed, and its unit."""
-    values, _, unit = healpix.read_map(path, tuple(names), moments.frame)
+def _positive(path: Path, moments: Moments, names: Sequence[str], alone: bool = True) -> tuple[Map, str | None]:
+    """Return a map of hits or variances, 0 where nothing was observed, and its unit.
+
+    ``alone``: a file with a single column holds it, whatever it is called.
+    """
+    values, _, unit = healpix.read_map(path, tuple(names), moments.frame, alone=alone)
     _check_nside(values, path, moments)
     if names is healpix.HITS:
         check_not_infinite(values, str(path))  # an infinite variance is that of a pixel that was not observed

@@ -256,18 +256,24 @@ VARIANCE = ("II_COV", "VARIANCE", "I_VAR", "COV_II", "VAR_I", "VAR")
 
 
 def read_map(
-    path: Path, names: tuple[str, ...] = (), frame: str | None = None, bad: float = healpy.UNSEEN
+    path: Path,
+    names: tuple[str, ...] = (),
+    frame: str | None = None,
+    bad: float = healpy.UNSEEN,
+    alone: bool = True,
 ) -> tuple[Map, str | None, str | None]:
     """Read a map of a HEALPix FITS file in RING order, and its frame and unit if the header has them.
 
     It is the column that is called one of ``names``; without names the temperature, or else the first column. A file
-    with a single column need not name it. Pixels of the value that the header calls BAD_DATA become ``bad``. A .npy
-    file holds an array of shape (npix,) in RING order; its frame and unit are None. Raise InputError if the file cannot
-    be read as a HEALPix map, does not say whether it is RING or NESTED, names an unknown frame, or another one than
-    ``frame``, or has a BAD_DATA that is no number.
+    with a single column need not name it, unless it holds something else (``alone`` False). Pixels of the value that
+    the header calls BAD_DATA become ``bad``. A .npy file holds an array of shape (npix,) in RING order; its frame and
+    unit are None. Raise InputError if the file cannot be read as a HEALPix map, does not say whether it is RING or
+    NESTED, names an unknown frame, or another one than ``frame``, or has a BAD_DATA that is no number.
     """
     if path.suffix == ".npy":
         array = read_npy(path, "biuf").astype(np.float64)
+        if not alone:
+            raise InputError(f"in {path} nothing is called {' or '.join(names)}; give that in another file.")
         if not healpy.isnpixok(array.size):
             raise InputError(f"{path} has {array.size} pixels, which is no HEALPix map; give all 12 nside^2 pixels.")
         return array, None, None
@@ -275,7 +281,7 @@ def read_map(
         raise InputError(f"{path} does not exist; give a HEALPix map in FITS.")
     with unreadable(path, "a HEALPix map", "give a complete FITS map"), warnings.catch_warnings():
         warnings.simplefilter("error", category=AstropyUserWarning)
-        field = _column_called(path, names)
+        field = _column_called(path, names, alone)
         map_, header = healpy.read_map(path, dtype=float, h=True, field=field)
     keywords = dict(header)
     if str(keywords.get("ORDERING", "")).strip().upper() not in ("RING", "NESTED"):
@@ -319,7 +325,7 @@ def read_uk(path: Path, frame: str, frequency_ghz: float | None) -> Map:
     return np.where(map_ > UNSEEN_BELOW, to_uk(unit, path, frequency_ghz) * map_, map_)
 
 
-def _column_called(path: Path, names: tuple[str, ...]) -> int:
+def _column_called(path: Path, names: tuple[str, ...], alone: bool) -> int:
     """Return the number of the map called one of ``names`` (none: of temperature), not counting pixel indices."""
     with opened(path) as hdus:
         table = first_table(hdus)
@@ -329,7 +335,7 @@ def _column_called(path: Path, names: tuple[str, ...]) -> int:
     for name in names or TEMPERATURE:
         if name in columns:
             return columns.index(name)
-    if len(columns) == 1 or not names:
+    if (len(columns) == 1 and alone) or not names:
         return 0
     raise InputError(f"{path} has the columns {', '.join(columns)} and none called {' or '.join(names)}; name it so.")
 

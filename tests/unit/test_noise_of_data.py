@@ -96,6 +96,16 @@ def test_hits_stand_beside_the_temperature_and_the_plan_says_the_level(observed,
     assert f"noise   W {level.sigma_uk:.6g} +-" in "\n".join(plan.cost(run).lines(2, 1))
 
 
+@pytest.mark.parametrize("columns", [{"TEMPERATURE": "mK"}, None], ids=["fits", "npy"])
+def test_temperatures_are_not_taken_for_hits(observed, columns, tmp_path):
+    """A monopole makes all of them positive."""
+    maps = [one + 1000.0 for one in observed[:2]]
+    if columns is not None:
+        maps = [table(tmp_path / f"{n}.fits", {"TEMPERATURE": one}, columns) for n, one in enumerate(maps)]
+    with refused("maps" if columns is None else "0.fits", "N_OBS", "HITS"):
+        difference_level(run_with({"kind": "difference", "maps": maps}), "W")
+
+
 @pytest.mark.parametrize(
     ("changes", "splits", "named"),
     [
