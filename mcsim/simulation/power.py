@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.errors import InputError
-from mcsim.simulation import windows
+from mcsim.simulation import mapmaking, windows
 from mcsim.simulation.channels import CIRCULAR, load_beam
-from mcsim.simulation.survey import Channel, Survey
+from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import spectra
+from mcsim.support.arrays import Map
 
 TOLERANCE = 0.5
 """Standard deviations by which neglected power may move the variance of the pixels of a map before it is refused."""
@@ -108,9 +109,20 @@ def _shifts(survey: Survey, spectrum: str) -> Iterator[tuple[str, NDArray[np.flo
         tail = np.append(np.cumsum(seen[:0:-1])[::-1], 0.0)
         for m in channel.maps:
             used = m.moments.hits > 0 if m.weight is None else m.weight > 0
-            noise = 0.0 if m.noise_uk is None else float(np.mean(m.noise_uk[used] ** 2))
+            level = _noise_uk(channel, m)
+            noise = 0.0 if level is None else float(np.mean(level[used] ** 2))
             total = noise + tail[survey.lmax] + SIGNAL_FLOOR**2 * float(seen.sum())
             yield m.name, tail, np.sqrt(used.sum() / 2.0) * tail / total
+
+
+def _noise_uk(channel: Channel, m: SurveyMap) -> Map | None:
+    """Return the standard deviation of the noise of pixels, of a differencing scan about; None: no noise."""
+    if m.noise_uk is not None or m.pairs is None or channel.side_b is None:
+        return m.noise_uk
+    level = mapmaking.level_uk(m.pairs, channel.side_b.sigma0_uk)
+    if level is None or m.preparation is None:
+        return level
+    return m.preparation.noise_uk(level, m.pairs.hits_a + m.pairs.hits_b)
 
 
 def check(survey: Survey) -> None:

@@ -11,7 +11,7 @@ from mcsim import config
 from mcsim.datavector.analysis import analysis_of
 from mcsim.errors import RunError
 from mcsim.instrument.scan.pointing import pointing
-from mcsim.simulation import differencing, mapmaking, simulate
+from mcsim.simulation import differencing, mapmaking, power, simulate
 from mcsim.simulation.survey import survey
 from mcsim.systematics.mapmaking import MapmakingConvergence
 from refusals import refused
@@ -93,6 +93,19 @@ def test_samples_nearer_to_the_centres_of_pixels_leave_nothing_of_the_dipole(kin
     without = replace(run, sky=replace(run.sky, dipole_uk=0.0))
     found, expected = (simulate.maps(survey(one), 0) for one in (run, without))
     np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("steps", [(), ({"kind": "degrade", "nside": 4},)], ids=["made", "prepared"])
+def test_sky_that_is_left_out_counts_against_the_noise_of_differences(steps):
+    """As where a diagnosis has asked for the noise of the pixels."""
+    run = config.load(config.to_dict(run_of(sigma0=4000.0)) | {"preparation": list(steps), "biposh": {"lmax": 8}})
+    by_noise = survey(run, orders=2)
+    assert all(m.noise_uk is not None for m in by_noise.maps)
+    found, expected = (list(power._shifts(one, "wmap7")) for one in (survey(run), by_noise))
+    for (_, _, shift), (_, _, other) in zip(found, expected, strict=True):
+        np.testing.assert_allclose(shift, other)
+        assert shift[LMAX] < power.ENOUGH
+    power.check(survey(run))
 
 
 def test_a_template_is_the_finite_difference_of_the_chain():
