@@ -236,7 +236,8 @@ def _channel(
         if isinstance(spec.scan, config.ScanDifferencing):
             model = scan_model(spec, spec.scan, split)
             refuse_excess(spec.name, acting)
-            scan.warn_of_aliases(model, grid)
+            sides = model.with_lines_of_sight(*(side.name for side in model.pair(spec.scan.pair)))
+            scan.warn_of_aliases(sides, grid)
             pairs = mapmaking.prepare(model, spec.scan.pair, grid, nthreads=nthreads, progress=progress)
             smax = max(beam.mmax, orders, 1)
             moments = pairs.moments(smax, nthreads, progress) if orders else pairs.hits_alone(smax)

@@ -238,6 +238,17 @@ def test_scans_that_cannot_be(year, scan, named):
         survey(year(scan))
 
 
+@pytest.mark.parametrize(("period_s", "other_s", "missed"), [(129.3, 50.0, True), (50.0, 129.3, False)])
+def test_few_phases_of_the_spin_are_those_of_the_pair(year, model, tmp_path, recwarn, period_s, other_s, missed):
+    """Not those of the lines of sight that the model takes where none are asked for."""
+    line = f'[[line_of_sight]]\nname = "C"\nboresight_angle_deg = 60.0\nsample_period_s = {other_s}\n'
+    text = model.read_text().replace("duration_days = 365.25", 'duration_days = 50.0\ndefault_lines = ["C"]')
+    path = tmp_path / "few.toml"
+    path.write_text(text.replace("= 157.8", f"= {period_s}").replace("[pairs]", f"{line}[pairs]"))
+    survey(year({"model": str(path)}))
+    assert any("phase" in str(one.message) for one in recwarn) == missed
+
+
 @pytest.mark.parametrize("other", [{}, {"beam_b": LONG | {"angle_deg": 70.0, "m_max": 0}}])
 def test_orders_that_were_left_out_come_back_on_both_sides(year, other):
     effect = config.Effect(name="beam_noncircularity", channel="W1", parameters={"amplitude": 1.0})
