@@ -272,8 +272,12 @@ def _circular(channel: Channel, seen: Alm, dipole: Alm | None) -> Alm:
 
 
 def _fiducial_response(channel: Channel) -> convolve.Response:
-    """Return the response to the dipole that is taken off: the fiducial beam, at the samples' own places."""
-    return convolve.response(channel.site.beam, channel.site.lmax, channel.seen_window)
+    """Return the response to the dipole that is taken off: the fiducial beam, at the samples' own places.
+
+    A dipole is seen through its first two orders alone.
+    """
+    beam = channel.site.beam
+    return convolve.response(beam.truncated(min(beam.mmax, 1)), channel.site.lmax, channel.seen_window)
 
 
 def _observe_on_rings(

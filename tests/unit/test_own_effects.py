@@ -1,4 +1,4 @@
-"""Surveys with nuisances that are a user's own effects, against those of runs with the effects that are drawn."""
+"""Surveys with a user's own effects, and with nuisances that are such effects."""
 
 from dataclasses import dataclass, replace
 
@@ -46,6 +46,26 @@ class HighGain(Own):
         if self.amplitude == 0.0 or site.frequency_ghz < 80.0:
             return None
         return self.amplitude * np.cos(time_s / 1e6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rounded(Own):
+    name = "rounded"
+
+    def beam(self, beam, site):
+        return beam.circular()
+
+
+def test_an_effect_may_leave_fewer_orders_than_the_model_has():
+    """The dipole is taken off through the beam of the model; it is the sky through a circular one that is left."""
+    table = two_channels("own", lmax=12, nside=8, sigma0_uk=0.0, period_s=300.0)
+    oval = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 900.0, "fwhm_minor_arcmin": 700.0}
+    acting, fiducial = (
+        config.load(table | {"channel": [channel | {"beam": beam} for channel in table["channel"]], "effect": effects})
+        for beam, effects in ((oval, [{"name": "rounded", "amplitude": 1.0}]), (oval | {"m_max": 0}, []))
+    )
+    found = survey(acting, library={**systematics.catalogue(), "rounded": Rounded})
+    np.testing.assert_allclose(simulate.maps(found, 0), simulate.maps(survey(fiducial), 0), atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", [BentGain, BentSignal, HighGain])
