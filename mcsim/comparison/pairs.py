@@ -61,6 +61,7 @@ class ChannelPair:
     #: the same with everything that effects need, before any preparation; None without a model
     channel: Channel | None = None
     hits: Maps | None = None  #: samples per pixel of the maps, of the model; None without one
+    usable: NDArray[np.bool_] | None = None  #: where the model has samples, and its mask weight; None without one
     sky_of_maps: bool = False  #: True if the scene's sky was taken from side A, and not from the model
     files: PointingFiles | None = None  #: samples of the channel, if the model has them in files
     #: a draw of what noise hides of the sky that side A shows, coefficients as the scene's; None if it hides nothing
@@ -394,6 +395,8 @@ def _pair(
                 f"a map of {name} on side {side} has no data: all of it is NaN or UNSEEN; give its values."
             )
     seen, one_sided = observed[0] & observed[1], int(np.sum(observed[0] != observed[1]))
+    if not seen.any(axis=1)[there].all():
+        raise InputError(f"the maps of {name} have no pixel in common; give both sides the same part of the sky.")
     if whole is None:
         return ChannelPair(name, tuple(maps), a, b, seen, absent, one_sided)
     finished, channel = (next(c for c in one.channels if c.name == name) for one in (whole, whole.making))
@@ -408,10 +411,8 @@ def _pair(
             "set map.nside to that of the maps."
         )
     hits = np.stack([m.moments.hits for m in finished.maps])
-    seen &= hits > 0
-    for index, m in enumerate(finished.maps):
-        if m.weight is not None:
-            seen[index] &= m.weight > 0
+    usable = np.stack([m.moments.hits * (1.0 if m.weight is None else m.weight) > 0.0 for m in finished.maps])
+    seen &= usable
     if not seen.any(axis=1)[there].all():
         raise InputError(f"the maps of {name} have no pixel in common with each other and the model; check the scan.")
     sky = whole.config.sky
@@ -424,7 +425,7 @@ def _pair(
         splits = whole.config.map.splits or (None,)
         paths = tuple(config.channel_path(spec.scan.path, name, split) for split in splits)
         files = PointingFiles(paths, channel.site.frame)
-    pair = ChannelPair(name, tuple(maps), a, b, seen, absent, one_sided, scene, channel, hits, not named, files)
+    pair = ChannelPair(name, tuple(maps), a, b, seen, absent, one_sided, scene, channel, hits, usable, not named, files)
     # Parallel transport is said of pixels' centres: there are no samples that a simulator could have elsewhere.
     pair = replace(pair, by_moments=isinstance(spec.scan, config.ScanParallelTransport))
     return pair if named else pair.with_sky_of_maps()

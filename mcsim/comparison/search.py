@@ -247,8 +247,8 @@ class Problem(Prediction):
         b = difference.undone(self.pair.b, value)
         if b is None:
             return None
-        known = (self.pair.a != healpy.UNSEEN) & (b != healpy.UNSEEN)
-        seen = known if self.pair.hits is None else known & (self.pair.hits > 0)
+        known = (self.pair.a != healpy.UNSEEN) & (b != healpy.UNSEEN) & np.any(self.pair.seen, axis=1, keepdims=True)
+        seen = known if self.pair.usable is None else known & self.pair.usable
         if not seen.any():
             return None
         return self.of_pair(replace(self.pair, b=b, seen=seen), self.others)

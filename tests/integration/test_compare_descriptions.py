@@ -162,6 +162,15 @@ def test_a_report_of_maps_that_are_the_same_draws_no_warning(factors):
     assert any("W1:half1" in one.get_title() for one in axes) == (factors[1] == 1.0)
 
 
+def test_maps_without_a_pixel_in_common_are_refused(tmp_path):
+    sky, half = np.random.default_rng(0).standard_normal(192), np.arange(192) < 96
+    for side, seen in (("a", half), ("b", ~half)):
+        (tmp_path / side).mkdir()
+        healpy.write_map(tmp_path / side / "W1.fits", np.where(seen, sky, healpy.UNSEEN), dtype=float)
+    with refused("W1"):
+        mcsim.compare(tmp_path / "a", tmp_path / "b")
+
+
 @pytest.mark.slow
 def test_the_nearest_set_is_said_as_a_whole():
     """A sign alone leaves more than there was; beside half a turn it leaves next to nothing."""

@@ -74,6 +74,18 @@ def test_a_unit_of_one_split_alone_is_named(simulator, side_a):
     assert "W1:half2; the other maps are identical" in str(found)
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_behind_a_unit_the_same_pixels_and_splits_are_compared(tmp_path, masked, simulator, side_a):
+    """Of a split alone, and of masked maps whose side B has something else behind the mask."""
+    outside = np.abs(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[2]) > 0.3
+    run, side_b = MODEL, [side_a[0], *scaled(simulator(psi=lambda p: p + np.deg2rad(30.0))[1:], 1e-6)]
+    if masked:
+        healpy.write_map(tmp_path / "mask.fits", outside.astype(float), dtype=float)
+        run = MODEL | {"map": MODEL["map"] | {"mask": str(tmp_path / "mask.fits")}}
+        side_b = [np.where(outside | (m < -1e20), m, m + 1e-3) for m in side_b]
+    assert sorted(names(mcsim.compare(side_a, side_b, run))) == ["psi_offset", "unit"]
+
+
 def test_zeros_that_stand_for_holes_hide_nothing(simulator, side_a):
     hole = np.abs(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[2]) < 0.3
     filled = [[np.where(hole, 0.0, m) for m in side] for side in (side_a, CASES["pixel_window"][0](simulator, side_a))]
