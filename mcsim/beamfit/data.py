@@ -99,6 +99,11 @@ class Measurement:
     highest: int | None = None  #: highest degree of the maps of the data; ``None``: not known, that of the model
 
     @property
+    def of_one_map(self) -> bool:
+        """Return True unless the pair is of two different maps."""
+        return is_of_one_map(self.pair)
+
+    @property
     def modes(self) -> tuple[Mode, ...]:
         """Modes, each once, in order."""
         return tuple(dict.fromkeys(row.mode for row in self.rows))
@@ -107,6 +112,11 @@ class Measurement:
     def lmax(self) -> int:
         """Largest ell."""
         return max(row.ell_max for row in self.rows)
+
+
+def is_of_one_map(pair: str | None) -> bool:
+    """Return True unless the label of a pair is that of two different maps."""
+    return pair is None or len(set(pair.split(","))) == 1
 
 
 def project(

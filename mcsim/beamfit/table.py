@@ -9,7 +9,7 @@ from astropy import units
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from mcsim.beamfit.data import EVERYTHING, SUMMARY, Measurement, Row, Scaling, Selection, refuse_filtered
+from mcsim.beamfit.data import EVERYTHING, SUMMARY, Measurement, Row, Scaling, Selection, is_of_one_map, refuse_filtered
 from mcsim.bipolar import Mode
 from mcsim.errors import InputError
 from mcsim.support.folders import unreadable
@@ -87,7 +87,7 @@ def _check_modes(path: str | Path, selection: Selection, rows: list[Row], label:
     if absent and selection.parsed != EVERYTHING.parsed:
         raise InputError(f"{path} has no {absent[0].name} at these ell; leave the mode out.")
     repeated = [mode for mode in selection.parsed if mode in found and not mode.in_auto]
-    if repeated and (label is None or len(set(label.split(","))) == 1):
+    if repeated and is_of_one_map(label):
         raise InputError(
             f"{path}: {repeated[0].name} of one map is zero, or repeats the mode with d = {-repeated[0].d}; leave the "
             "mode out, or name the pair of different maps."

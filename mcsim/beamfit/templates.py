@@ -71,7 +71,7 @@ class Templates:
         seen = expectation.signal(self.survey, (x, y), self.pair, modes, exact, self.nthreads)
         if self.control is not None:
             seen = seen - self.control
-        if self.measured.kind == "plain" and self.pair[0] == self.pair[1]:
+        if self.measured.kind == "plain" and self.measured.of_one_map:
             seen = seen + expectation.noise_mean(self.survey, self.pair[0], modes)
         spectra = dict(zip(modes, seen, strict=True))
         return project(self.measured.rows, self.measured.scaling, spectra, self.measured.highest)

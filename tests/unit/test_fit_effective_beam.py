@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
+from comparisons import MODEL as SMALL
 from mcsim import config
-from mcsim.beamfit import Measurement, Selection, comparisons, fit_each, measurement, orientation, report
+from mcsim.beamfit import QUADRUPOLE, Measurement, Selection, comparisons, fit_each, measurement, orientation, report
 from mcsim.beamfit import fit as fit_to_any_order
 from mcsim.beamfit.data import SUMMARY, Row, project
+from mcsim.beamfit.templates import templates
 from mcsim.bipolar import parse_mode
 from mcsim.bipolar.theory import ScannedBeam, cmb_biposh_leading
 from mcsim.ensemble import expectation, prediction
@@ -61,6 +63,22 @@ ELL = np.arange(LMAX + 1.0)
 def fit(data, source, name="constant"):
     """Data made to leading order are fitted to leading order; tests/unit/test_fit_exact.py has the others."""
     return fit_to_any_order(data, source, name, order="leading")
+
+
+def test_two_maps_have_no_noise_in_common_even_if_one_stands_for_both():
+    channel = SMALL["channel"][0] | {"noise": {"sigma0_uk": 100.0}}
+    noisy = survey(config.load(SMALL | {"map": {"nside": 16}, "channel": [channel]}))
+    rows = tuple(Row(parse_mode(name), 8, 24, False) for name in QUADRUPOLE)
+    measured = Measurement("synthetic", None, "plain", rows, SUMMARY, np.zeros(2), np.eye(2), None)
+    made = templates(noisy, measured)
+    alone, itself, other = (
+        replace(made, measured=replace(measured, pair=pair)).data(np.ones(33)) for pair in (None, "A,A", "A,B")
+    )
+    noise = expectation.noise_mean(noisy, 0, measured.modes)
+    np.testing.assert_array_equal(alone, itself)
+    np.testing.assert_allclose(
+        alone - other, project(rows, SUMMARY, dict(zip(measured.modes, noise, strict=True))), rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize(
