@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,13 +35,19 @@ class Selection:
             raise InputError(f"modes = {self.modes!r} are no different labels; give some such as ['L2M0d0'].")
         if self.kind is not None and self.kind not in get_args(Kind):
             raise InputError(f"the kind of spectra {self.kind!r} is not known; give plain or difference.")
-        if self.ell_range is not None and not 0 <= self.ell_range[0] <= self.ell_range[1]:
-            raise InputError(f"ell = {self.ell_range[0]} ... {self.ell_range[1]} is no range; give 0 <= first <= last.")
+        if self.ell_range is not None and not _is_range(self.ell_range):
+            raise InputError(f"ell_range = {self.ell_range!r} is no range; give (first, last), 0 <= first <= last.")
 
     @property
     def parsed(self) -> tuple[Mode, ...]:
         """Modes, parsed from their labels."""
-        return tuple(parse_mode(name) for name in self.modes)
+        return tuple(parse_mode(str(name)) for name in self.modes)
+
+
+def _is_range(given: Any) -> bool:
+    """Return True for two whole numbers of degrees, in order."""
+    ends: Any = given if isinstance(given, Sequence) and len(given) == 2 else ("", "")
+    return all(isinstance(end, int | np.integer) for end in ends) and bool(0 <= ends[0] <= ends[1])
 
 
 EVERYTHING = Selection()  #: the quadrupole modes at every ell

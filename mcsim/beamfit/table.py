@@ -168,7 +168,7 @@ def scaling_of(path: str | Path, meta: Any) -> Scaling:
             f"{path} has normalisation {normalisation!r}, which is not known; write Bennett or Hajian-Souradeep."
         )
     bare = re.sub(r"[\s()\\*_{}]", "", scaling.replace("ell", "l").replace("π", "pi"))
-    spectrum = bare.startswith("ll+1/2pi")
+    spectrum = re.match(r"ll\+1/2pi($|,|a)", bare) is not None  # "A, mean over ..." may follow, but no other factor
     if not spectrum and bare not in ("none", "raw", "1"):
         raise InputError(f'{path} has scaling {scaling!r}, which is not known; write "l(l+1)/2pi" or "none".')
     # The header of an exported summary defines the scaling of odd parity.

@@ -203,6 +203,11 @@ def test_ensembles_of_the_same_configuration_are_accepted(shared):
         {"modes": ("L2M0",)},
         {"ell_range": (40, 10)},
         {"ell_range": (-1, 10)},
+        {"ell_range": (10, 20, 30)},
+        {"ell_range": (10,)},
+        {"ell_range": 10},
+        {"ell_range": ("10", "20")},
+        {"modes": (("L2M0d0", "L2M0d2"),)},
         {"kind": "paired"},
     ],
 )

@@ -94,6 +94,8 @@ def test_parts_of_complex_modes_share_the_variance(tmp_path):
         (table(META | {"normalisation": ""}), {}, ("normalisation", "Bennett")),
         (table(META | {"normalisation": "unity"}), {}, ("unity", "Bennett")),
         (table(META | {"scaling": "l^2"}), {}, ("scaling", "'l^2'")),
+        (table(META | {"scaling": "l(l+1)/2pi * 1e12"}), {}, ("scaling", "l(l+1)/2pi * 1e12")),
+        (table(META | {"scaling": "l(l+1)/2pi/sqrt(2L+1)"}), {}, ("scaling", "l(l+1)/2pi/sqrt(2l+1)")),
         (table({"normalisation": "Bennett"}), {}, ("scaling ''",)),
         (table(META | {"frame": "galactic"}), {}, ("galactic", "ecliptic")),
         (table(unit=None), {}, ("value", "unit", "uK2")),
