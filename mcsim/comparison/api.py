@@ -278,6 +278,7 @@ def _looks(pair: ChannelPair, explained: NDArray[np.float64]) -> tuple[str, ...]
 
 
 def _described(found: Set, problem: Problem) -> tuple[DifferenceResult, ...]:
+    """Return the members of a set in the order in which they act: from side B to side A it is the other one."""
     described = []
     for index, (difference, made) in enumerate(found.members):
         value, said = made, [difference.said(made)]
@@ -292,16 +293,20 @@ def _described(found: Set, problem: Problem) -> tuple[DifferenceResult, ...]:
                 without - found.left, difference.parameters(value), difference.met, "; ".join(filter(None, said)),
             )
         )  # fmt: skip
-    return tuple(described)
+    return tuple(described[::-1] if problem.pair.turned else described)
 
 
 def _equivalent(found: Set, own: tuple[DifferenceResult, ...], exchanged: bool) -> list[tuple[DifferenceResult, ...]]:
     """Return the sets that make the same maps under other names."""
-    return [
-        (*own[:i], replace(d, name=name, amplitude=amplitude, unit=unit, parameters={}), *own[i + 1 :])
-        for i, (d, (difference, value)) in enumerate(zip(own, found.members, strict=True))
-        for name, amplitude, unit in difference.equivalent(difference.inverse(value) if exchanged else value)
-    ]
+    members = [(d, d.inverse(v)) for d, v in found.members[::-1]] if exchanged else list(found.members)
+    same = []
+    for i, (d, (difference, value)) in enumerate(zip(own, members, strict=True)):
+        # A turn of psi that is mirrored after it is one of the beam the other way.
+        mirrored = difference.turns and sum(later.mirrors for later, _ in members[i + 1 :]) % 2
+        for name, amplitude, unit in difference.equivalent(-value if mirrored else value):
+            other = replace(d, name=name, amplitude=amplitude, unit=unit, parameters={})
+            same.append((*own[:i], other, *own[i + 1 :]))
+    return same
 
 
 def _rms(values: NDArray[np.float64]) -> float:

@@ -68,6 +68,7 @@ class Difference:
     exchanges: ClassVar[bool] = False
     #: True if it turns or mirrors samples or beam: what two of these make together neither says by itself
     turns: ClassVar[bool] = False
+    mirrors: ClassVar[bool] = False  #: True if what turns samples or beam before it has the other sign after it
     #: ways, mutual: values to try where only some are possible; True if the other side's has the other sign
     ways: ClassVar[tuple[float, ...]] = (1.0,)
     mutual: ClassVar[bool] = False

@@ -363,3 +363,6 @@ class NoiseShared(Difference):
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         return maps + value[0] * self._exchanged(value, state)
+
+    def found(self, value: Vector) -> str:
+        return "in side A"

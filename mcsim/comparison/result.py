@@ -32,7 +32,8 @@ class DifferenceResult:
     def words(self) -> str:
         """Name and amplitude, or what an amplitude of 1 means where it can be nothing else."""
         meaning = self.unit.removeprefix("1 = ")
-        alone = meaning != self.unit and self.amplitude == 1.0
+        alone = meaning != self.unit and abs(self.amplitude) == 1.0
+        meaning += " in side A" if self.amplitude < 0.0 else ""
         also = f" ({self.said})" if self.said else ""
         return f"{self.name} ({meaning})" if alone else f"{self.name} = {number(self.amplitude)} {self.unit}{also}"
 

@@ -72,7 +72,7 @@ class PsiSign(Difference):
 
     name, unit = "psi_sign", "1 = reversed"
     met = "COSMO and IAU conventions, or a reflected focal plane"
-    turns = True
+    turns = mirrors = True
 
     def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
         return scene.reversed()
@@ -83,7 +83,7 @@ class BeamConjugated(Difference):
 
     name, unit = "beam_conjugated", "1 = opposite m"
     met = "beam coefficients of e^(im phi) where e^(-im phi) was meant"
-    turns = True
+    turns = mirrors = True
     ways = (1.0, -1.0)
     counted = False
 
@@ -261,6 +261,7 @@ class PixelCentres(Difference):
 
     name, unit = "pixel_centres", "1 = samples at the centres"
     met = "pointing rounded to pixels before the sky is looked up"
+    mutual = True
 
     def starts(self, state: State) -> list[Vector]:
         known = state.scene is not None and state.scene.moments[0].dtheta is not None

@@ -172,6 +172,9 @@ class Interpolation(Difference):
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         return maps + self._response(value, state.pair)
 
+    def found(self, value: Vector) -> str:
+        return "in side A"
+
     def parameters(self, value: Vector) -> dict[str, float | str]:
         return {"between": "four pixels" if value[1] else "the nearest pixel"}
 

@@ -352,11 +352,11 @@ def test_both_ways_to_mirror_coordinates_are_tried_beside_others():
     assert found.channels[0].left < 1e-4
 
 
-@pytest.mark.parametrize("name", ["lmax_cut", "mmax_cut"])
-def test_the_model_may_describe_the_other_side(name, simulator, side_a):
+@pytest.mark.parametrize(("name", "amplitude"), [("lmax_cut", 22.0), ("mmax_cut", 0.0), ("pixel_centres", -1.0)])
+def test_the_model_may_describe_the_other_side(name, amplitude, simulator, side_a):
     found = mcsim.compare(CASES[name][0](simulator, side_a), side_a, simulator.run)
     assert names(found) == [name]
-    assert found.channels[0].differences[0].amplitude == CASES[name][1]
+    assert found.channels[0].differences[0].amplitude == amplitude
     assert found.to_dict()["model_describes"] == {"W1": "b"}
     assert found.channels[0].left < 0.01
     assert "the model describes side B" in str(found)

@@ -141,6 +141,30 @@ def test_what_a_wrong_beam_leaves_of_the_sky_is_no_noise():
         assert len(NoiseShared().starts(State(pair, None, maps, ()))) == 2 * expected
 
 
+def test_a_mirrored_turn_is_the_same_from_either_side(tmp_path):
+    """If psi of one side is that of the other times -1 plus 30 degrees, so is that of the other one."""
+    simulator = Simulator(small(map={"nside": 16}))
+    one, other = simulator(), simulator(psi=lambda p: np.deg2rad(30.0) - p)
+    same = simulator(beam=simulator.site.beam.rotated(np.deg2rad(30.0)), psi=lambda p: -p)
+    np.testing.assert_allclose(np.stack(same), np.stack(other), atol=1e-5)
+    PEAR.save(tmp_path / "pear.npz")
+    for side, maps in (("a", other), ("b", one)):
+        (tmp_path / side).mkdir()
+        healpy.write_map(tmp_path / side / "W1.fits", maps[0], dtype=np.float64, column_units="uK")
+    beam = f'beam = {{ kind = "blm", path = "{tmp_path / "pear.npz"}" }}\n'
+    (tmp_path / "b" / "model.toml").write_text(
+        "".join(beam if line.startswith("beam") else line for line in DESCRIPTION.splitlines(keepends=True))
+    )
+    for found in (mcsim.compare(one, other, simulator.run), mcsim.compare(tmp_path / "a", tmp_path / "b")):
+        [channel] = found.channels
+        psi, turn = 1.0, 0.0
+        for d in channel.differences:
+            psi, turn = (-psi, -turn) if d.name == "psi_sign" else (psi, turn + d.amplitude)
+        assert (psi, turn) == (-1.0, pytest.approx(30.0, abs=0.1))
+        [turned] = [d.amplitude for one in channel.alternatives for d in one if d.name == "beam_turned"]
+        assert turned == pytest.approx(30.0, abs=0.1)
+
+
 def test_an_effect_that_is_impossibly_large_has_no_response():
     simulator = Simulator()
     side_a = simulator()

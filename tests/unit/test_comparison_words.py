@@ -12,6 +12,7 @@ from mcsim.systematics.beams import BeamSidelobe
     ("amplitude", "unit", "words"),
     [
         (1.0, "1 = opposite m", "one (opposite m)"),
+        (-1.0, "1 = NESTED for RING", "one (NESTED for RING in side A)"),
         (-40.0, "deg", "one = −40 deg"),
         (0.01, "fraction", "one = 0.01 fraction"),
     ],
