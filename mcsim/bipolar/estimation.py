@@ -43,7 +43,7 @@ def _range(exists: NDArray[np.bool_]) -> slice:
     return slice(int(where[0]), int(where[-1]) + 1) if where.size else slice(0)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=4, typed=True)
 def estimator(L_max: int, lmax: int, both_orders: bool = False) -> Estimator:
     """Return the Clebsch-Gordan tables for all modes up to L_max at l1, l2 <= lmax.
 

@@ -110,3 +110,10 @@ def test_bennett_factor_needs_even_parity() -> None:
 def test_bad_l_max() -> None:
     with refused("L_max", 9, 7):
         bipolar.estimator(9, LMAX)
+
+
+@pytest.mark.parametrize("L_max", [1.0, True])
+def test_tables_that_are_kept_let_no_bad_l_max_pass(L_max) -> None:
+    bipolar.estimator(1, LMAX)
+    with refused("L_max", L_max):
+        bipolar.estimator(L_max, LMAX)
