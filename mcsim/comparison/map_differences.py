@@ -317,7 +317,7 @@ class NoiseShared(Difference):
     moved = 1
 
     def starts(self, state: State) -> list[Vector]:
-        """Return correlation, split that is changed (-1: all), split or channel that it is shared with, and how.
+        """Return share that fits, split that is changed (-1: all), split or channel that it is shared with, and how.
 
         Noise of the same samples, or of the same deviates and other hits; from maps, or less the sky simulated. Only
         what the model says to be noise is shared.
@@ -363,6 +363,14 @@ class NoiseShared(Difference):
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         return maps + value[0] * self._exchanged(value, state)
+
+    def amplitude(self, value: Vector) -> float:
+        """Return the correlation c with which noise of the same size has this share of the other noise less its own.
+
+        Of sqrt(1 - c^2) own + c other, less own, the share that fits is (1 + c - sqrt(1 - c^2))/2.
+        """
+        twice = np.clip(2.0 * value[0] - 1.0, -np.sqrt(2.0), 1.0)
+        return float(twice + np.sqrt(2.0 - twice**2)) / 2.0
 
     def found(self, value: Vector) -> str:
         return "in side A"

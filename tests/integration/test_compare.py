@@ -203,6 +203,21 @@ def test_channels_exchanged_or_with_the_same_noise_are_named():
     assert found.channels[1].differences[0].amplitude == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.parametrize("correlation", [0.7, 0.8, 1.0])
+def test_noise_that_is_shared_in_part_has_its_correlation(correlation, simulator, side_a):
+    run = replace(simulator.run, channels=(replace(simulator.run.channels[0], noise=config.Noise(sigma0_uk=60.0)),))
+    hits = [np.maximum(m.moments.hits, 1.0) for m in survey(run).making.channels[0].maps]
+    own, other = np.random.default_rng(6).standard_normal((2, hits[0].size))
+    both = np.sqrt(1.0 - correlation**2) * own + correlation * other
+    a, b = (
+        [np.where(m > -1e20, m + 60.0 * n / np.sqrt(h), m) for m, n, h in zip(side_a, noise, hits, strict=True)]
+        for noise in ((own, other), (both, other))
+    )
+    [found] = mcsim.compare(a, b, run).channels[0].differences
+    assert found.name == "noise_shared"
+    assert found.amplitude == pytest.approx(correlation, abs=0.02)
+
+
 @pytest.mark.parametrize("width", [-0.1, 0.1])
 def test_noise_in_common_is_not_that_of_another_channel(width):
     """What it hides of the sky, seen through another beam, is like a part of it: 1 to 4 % were said to be shared."""
