@@ -1,6 +1,9 @@
 """Measured BipoSH spectra from a table: ECSV with columns L, M, d, ell_min, ell_max, value, error."""
 
 import re
+import warnings
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +70,8 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
     if len(set(rows)) < len(rows):
         raise InputError(f"{path} gives a bin of one mode twice; keep one row of each.")
     _check_modes(path, selection, rows, label)
+    if errors:
+        _warn_of_overlaps(path, rows)
     value = np.concatenate(values)
     sigma = np.concatenate(sigmas) if errors else np.ones_like(value)
     bad = np.flatnonzero(~(np.isfinite(value) & np.isfinite(sigma) & (sigma > 0.0)))
@@ -92,6 +97,19 @@ def _check_modes(path: str | Path, selection: Selection, rows: list[Row], label:
             f"{path}: {repeated[0].name} of one map is zero, or repeats the mode with d = {-repeated[0].d}; leave the "
             "mode out, or name the pair of different maps."
         )
+
+
+def _warn_of_overlaps(path: str | Path, rows: Sequence[Row]) -> None:
+    """Warn of bins of one mode that share degrees: errors of a table are taken for independent."""
+    for one, other in pairwise(sorted(rows, key=lambda row: (row.mode, row.imaginary, row.ell_min))):
+        if (one.mode, one.imaginary) == (other.mode, other.imaginary) and other.ell_min <= one.ell_max:
+            warnings.warn(
+                f"{path}: the bins of {one.mode.name} at ell = {one.ell_min}-{one.ell_max} and {other.ell_min}-"
+                f"{other.ell_max} overlap, but errors of a table are taken for independent; give bins that share no "
+                "ell, or the covariance of a store.",
+                stacklevel=5,
+            )
+            return
 
 
 def check_frame(path: str | Path, found: str, wanted: str) -> None:

@@ -158,6 +158,13 @@ def test_a_file_that_is_no_table(tmp_path):
         read_table(tmp_path / "map.fits", "ecliptic")
 
 
+def test_bins_that_overlap_are_not_independent(tmp_path):
+    made = table(ell_min=[10, 19, 10])
+    with pytest.warns(UserWarning, match="L2M0d0 at ell = 10-19 and 19-29 overlap"):
+        read(tmp_path, made)
+    read_table(tmp_path / "table.ecsv", "ecliptic", errors=False)
+
+
 def test_errors_that_do_not_count_may_be_missing(tmp_path):
     made = table(error=[np.nan, 0.0, 0.3])
     with refused("L2M0d0", "error"):
