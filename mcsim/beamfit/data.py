@@ -198,13 +198,17 @@ def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None
     """Return the data of a measurement with the covariance of one realization of an ensemble that models it.
 
     The measurement is usually from a table, whose own errors are not used. ``pair`` is a label of the store; by default
-    that of the measurement, or the store's first. InputError if the store lacks a mode or degree of the measurement, or
-    filters its maps.
+    that of the measurement, or the store's first of one map, or of two, as it is. InputError if the store lacks such a
+    pair, or a mode or degree of the measurement, or filters its maps.
     """
     with opening.open_ensemble(path) as ensemble:
         refuse_filtered(path, ensemble.attrs["configuration"]["biposh"].get("filter", "none"))
         labels = [str(name) for name in ensemble["pair"].values]
-    label = pair or (measured.pair if measured.pair in labels else labels[0])
+    alike = [name for name in labels if is_of_one_map(name) == measured.of_one_map]
+    if not (pair or alike):
+        kind = "one map" if measured.of_one_map else "two different maps"
+        raise InputError(f"{path} has no pair of {kind}, as the data are; give a store that has, or name a pair of it.")
+    label = pair or (measured.pair if measured.pair in labels else alike[0])
     drawn = realizations(path, measured.rows, measured.scaling, measured.kind, label, measured.highest)
     return replace(measured, covariance=_covariance(drawn), simulations=len(drawn))
 

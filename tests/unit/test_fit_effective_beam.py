@@ -7,9 +7,21 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
+import mcsim
 from comparisons import MODEL as SMALL
 from mcsim import config
-from mcsim.beamfit import QUADRUPOLE, Measurement, Selection, comparisons, fit_each, measurement, orientation, report
+from mcsim.beamfit import (
+    QUADRUPOLE,
+    Measurement,
+    Selection,
+    comparisons,
+    fit_each,
+    from_store,
+    measurement,
+    orientation,
+    report,
+    with_covariance_of,
+)
 from mcsim.beamfit import fit as fit_to_any_order
 from mcsim.beamfit.data import SUMMARY, Row, project
 from mcsim.beamfit.templates import templates
@@ -79,6 +91,18 @@ def test_two_maps_have_no_noise_in_common_even_if_one_stands_for_both():
     np.testing.assert_allclose(
         alone - other, project(rows, SUMMARY, dict(zip(measured.modes, noise, strict=True))), rtol=1e-9
     )
+
+
+def test_covariances_of_two_maps_are_those_of_such_a_pair(tmp_path):
+    biposh, ensemble = {"L_max": 2, "summary_bin": 8}, {"realizations": 4, "seed": 3}
+    run = SMALL | {"biposh": biposh, "ensemble": ensemble, "compute": {"workers": 1}}
+    store = mcsim.run(run, tmp_path / "all.zarr").store
+    measured = from_store(store, Selection(modes=["L2M0d0"], pair="W1:half1,W1:half2"))
+    own = with_covariance_of(measured, store).covariance
+    np.testing.assert_array_equal(with_covariance_of(replace(measured, pair="A,B"), store).covariance, own)
+    alone = mcsim.run(run | {"biposh": biposh | {"pairs": "auto"}}, tmp_path / "auto.zarr").store
+    with refused("auto.zarr"):
+        with_covariance_of(replace(measured, pair="A,B"), alone)
 
 
 @pytest.mark.parametrize(
