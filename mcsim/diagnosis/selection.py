@@ -88,9 +88,9 @@ class Attribution:
         return replace(self.unexplained(), faint=True)
 
     def of(self, explanations: Sequence[Explanation]) -> "Attribution":
-        """Return the attribution with some of its explanations, in order, with odds against the best of these."""
-        best = max((one.odds for one in explanations), default=1.0)
-        explanations = tuple(replace(one, odds=one.odds / best) for one in explanations)
+        """Return the attribution with some explanations, the most probable first, with odds against that one."""
+        ranked = sorted(explanations, key=lambda one: -one.odds)
+        explanations = tuple(replace(one, odds=one.odds / ranked[0].odds) for one in ranked)
         kept = {one.members: place for place, one in enumerate(explanations)}
         places = [kept.get(one.members) for one in self.explanations]
         contrasts = tuple(

@@ -125,6 +125,9 @@ def test_odds_are_against_the_best_of_the_sets_that_stay(bench):
     sets = tuple(replace(one, members=(member,), odds=odds) for member, odds in enumerate((1.0, 0.5, 0.25)))
     assert [each.odds for each in found.of(sets).explanations] == [1.0, 0.5, 0.25]
     assert [each.odds for each in found.of(sets[1:]).explanations] == [1.0, 0.5]
+    # A set that parts contradict, and that stays by its odds, comes behind those that agree.
+    later = found.of((sets[1], sets[2], sets[0])).explanations
+    assert [(each.members, each.odds) for each in later] == [((0,), 1.0), ((1,), 0.5), ((2,), 0.25)]
     assert found.of(()).explanations == ()
 
 
