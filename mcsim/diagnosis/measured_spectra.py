@@ -60,8 +60,9 @@ class MeasuredSpectra(DataSet[Spectra]):
 
     def notes(self) -> list[str]:
         """Return a sentence if the table's errors are far from the scatter of the simulations."""
-        ratio = float(np.median(self.data.error / self.context.ensemble.simulations.std(axis=0, ddof=1)))
-        if not np.isfinite(ratio) or 0.5 < ratio < 2.0:
+        ratios = self.data.error / self.context.ensemble.simulations.std(axis=0, ddof=1)
+        ratios = ratios[np.isfinite(ratios)]
+        if not len(ratios) or 0.5 < (ratio := np.median(ratios)) < 2.0:
             return []
         return [
             f"The table's errors are {ratio:.2g} times the scatter of simulations of the model for a mean of "

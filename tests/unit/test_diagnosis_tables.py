@@ -252,7 +252,8 @@ def test_a_mean_of_more_skies_than_it_says_is_refused(small, tmp_path):
 def test_errors_that_the_model_does_not_have_are_noted(small, tmp_path):
     spectra = read(tmp_path, measured(RUN))
     spread = small.ensemble.simulations.std(axis=0)
-    for factor, noted in ((1.0, 0), (3.0, 1)):
+    first = np.arange(len(spread)) == 0
+    for factor, noted in ((1.0, 0), (3.0, 1), (np.nan, 0), (np.where(first, np.nan, 3.0), 1)):
         found = MeasuredSpectra(small, replace(spectra, error=factor * spread), lambda jobs: [])
         assert len(found.notes()) == noted
 
