@@ -23,7 +23,7 @@ from mcsim.reconstruction.result import HEAD, Reconstructed
 from mcsim.stats.excess import HeldOut, Measured, excess_of
 from mcsim.stats.look_elsewhere import GlobalTest
 from mcsim.support.arrays import Vector, texts
-from mcsim.support.folders import write_whole
+from mcsim.support.folders import unreadable, write_whole
 
 STORE = "diagnosis.zarr"
 PLACES = 12  #: groups in the localisation table of ``verdict.json`` and of the report
@@ -363,16 +363,19 @@ class DiagnosisResult:
         Raises
         ------
         InputError
-            If the folder holds no diagnosis.
+            If the folder holds no diagnosis, or one that is not whole.
         """
         path = Path(folder) / STORE
         if not path.is_dir():
             raise InputError(f"{path} does not exist; give the output folder of mcsim diagnose.")
-        with xr.open_zarr(path, chunks=None, consolidated=False) as stored:
-            arrays: dict[str, Any] = {name: np.asarray(stored[name]) if name in stored else None for name in _ARRAYS}
-            rest = json.loads(stored.attrs["result"])
-        hints = get_type_hints(cls)
-        return cls(**arrays, **{key: TypeAdapter(hints[key]).validate_python(value) for key, value in rest.items()})
+        values: dict[str, Any] = dict.fromkeys(_ARRAYS)
+        with unreadable(path, "a diagnosis", "run mcsim diagnose again"):
+            with xr.open_zarr(path, chunks=None, consolidated=False) as stored:
+                values |= {name: np.asarray(stored[name]) for name in _ARRAYS if name in stored}
+                rest = json.loads(stored.attrs["result"])
+            hints = get_type_hints(cls)
+            values |= {key: TypeAdapter(hints[key]).validate_python(value) for key, value in rest.items()}
+            return cls(**values)
 
 
 _OF_ELEMENT = "see element_unit"

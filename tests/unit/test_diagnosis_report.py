@@ -375,15 +375,13 @@ def test_result_comes_back_from_disk_as_it_was(diagnoses, pages, tmp_path, kind)
     for field in fields(one):
         if field.name not in ("candidates", "residual_maps"):  # with NaN
             np.testing.assert_equal(getattr(again, field.name), getattr(one, field.name))
-    if kind == "mixture":
-        with quick_pictures():
-            assert report.page(again) == pages[kind]
-    else:
-        with quick_pictures(empty=True):
-            assert report.page(again) == report.page(one)
+    with quick_pictures(empty=kind != "mixture"):
+        assert report.page(again) == (pages[kind] if kind == "mixture" else report.page(one))
 
 
-def test_a_folder_without_a_diagnosis_is_named(tmp_path):
+@pytest.mark.parametrize("made", ["", "diagnosis.zarr"])
+def test_a_folder_without_a_whole_diagnosis_is_named(tmp_path, made):
+    (tmp_path / made).mkdir(exist_ok=True)
     with refused(tmp_path.name):
         DiagnosisResult.open(tmp_path)
 
