@@ -54,7 +54,7 @@ def _effects(effects: Sequence[EffectResult]) -> str:
 def tested(result: DiagnosisResult) -> str:
     """Return what was tested: elements, maps, simulations and candidates."""
     splits = len({one.split for one in result.elements if one.split})
-    source = f"{len(result.maps)} maps" + (f" ({splits} splits)" if splits > 1 else "")
+    source = f"{len(result.maps)} map{'s' * (len(result.maps) > 1)}" + (f" ({splits} splits)" if splits > 1 else "")
     if result.residual_maps is None:
         source = "a table of spectra"
     by = "" if result.agreement is None else f" by {result.agreement.simulator}"

@@ -222,6 +222,7 @@ def test_first_screen_says_what_was_tested_and_found(diagnoses, pages, kind):
         assert " ".join(text.split()) in header
     assert f"{P} elements" in header
     assert f"{N} simulations" in header
+    assert "measured from 1 map;" in words.tested(replace(result, elements=(), maps=("W",)))
     for effect in result.effects:
         assert effect.words in header
         assert effect.label in header
