@@ -134,14 +134,14 @@ class Division:
 class Slices:
     """Test sets of effects in parts of a data vector and of the numbers beside it.
 
-    ``ensemble`` and ``z``, shape (p + E,), are both together; the last E elements are the numbers beside. ``splits``
-    are names, in the order of the folds, of a frame's maps up to the degree ``lmax``.
+    ``ensemble`` and ``z``, shape (p + E,), are both together; the last E elements are the numbers beside. ``folds``
+    are those of the data vector in words, and ``lmax`` is its highest degree.
     """
 
     ensemble: NullEnsemble
     z: Vector
     beside: int
-    splits: tuple[str, ...]
+    folds: tuple[str, str]
     lmax: int
     settings: DiagnosisSettings
     scatters: tuple[Matrix, ...] = ()  # of stochastic effects, (p + E, draws), that add to the covariance
@@ -192,8 +192,7 @@ class Slices:
     def _divisions(self, candidate: Candidate) -> Iterator[Division]:
         own, first = self._own(candidate.channel), len(self.z) - self.beside
         halves = [[row for row, e in own if e.fold == fold] for fold in (0, 1)]
-        words = tuple(" and ".join(self.splits[fold::2]) for fold in (0, 1)) if len(self.splits) > 1 else _HALVES
-        yield _of_rows("halves", words, halves)
+        yield _of_rows("halves", self.folds, halves)
         noisy = acts_through(candidate.effect, "noise")  # it shows in differences of splits, and in pixels
         ends = {e for e in (LARGE, max(LARGE, bins(2, self.lmax, 2)[0][1])) if e < self.lmax}
         edges = [e for _, e in scales(self.lmax)] if noisy else sorted({*ends, self.lmax})
@@ -329,9 +328,6 @@ class Slices:
         p = float(null.residual_test(found.chi2, null.dimension - found.dimension, tolerated))
         scale = null.hartlap_factor
         return MapCheck(tuple(maps), scale * null.chi2(x), scale * found.chi2, forecast, found.dimension, p)
-
-
-_HALVES = ("even degrees and pixels", "odd degrees and pixels")
 
 
 def _of_rows(kind: str, words: tuple[str, ...], parts: Sequence[Sequence[int]]) -> Division:

@@ -121,6 +121,11 @@ class DataSet(ABC, Generic[Data]):
         """Return the number of skies of which the data are the mean."""
         return 1
 
+    @property
+    @abstractmethod
+    def folds(self) -> tuple[str, str]:
+        """Return what the two folds of the data vector are, in words."""
+
     @abstractmethod
     def halves(self) -> tuple[Matrix, str]:
         """Return a matrix that makes the two folds of the data vector independent, and what they are in words."""

@@ -69,6 +69,11 @@ class MeasuredSpectra(DataSet[Spectra]):
             f"{self.realizations} skies; the latter was used."
         ]
 
+    @property
+    def folds(self) -> tuple[str, str]:
+        """Return words for the bins of fold 0, and for those of fold 1."""
+        return "every other bin", "the bins between"
+
     def halves(self) -> tuple[Matrix, str]:
         """Return the matrix that subtracts from elements of fold 1 what those of fold 0 predict, and words."""
         ensemble = self.context.ensemble

@@ -74,7 +74,7 @@ def slices_of(data: DataSet[Any]) -> Slices:
     context, z = data.context, data.extended
     beside, lmax = len(z) - len(data.x), context.analysis.model.lmax
     known = {np.arange(len(data.x)).tobytes(): context.null}  # estimated once for all data sets
-    return Slices(context.ensemble.extended, z, beside, context.run.map.splits, lmax, context.settings, nulls=known)
+    return Slices(context.ensemble.extended, z, beside, data.folds, lmax, context.settings, nulls=known)
 
 
 def unconfirmed(context: DiagnosisContext, found: Attribution, reduced: bool) -> str:

@@ -125,11 +125,18 @@ class ObservedMaps(DataSet[Sequence[Map]]):
                 notes.append(f"The model fits (p = {p:.2g}) with maps exchanged: {pairs}.")
         return notes
 
+    @property
+    def folds(self) -> tuple[str, str]:
+        """Return the names of the splits of each fold; without splits the folds are degrees and pixels."""
+        if len(splits := self.context.run.map.splits) > 1:
+            return " and ".join(splits[::2]), " and ".join(splits[1::2])
+        return "even degrees and pixels", "odd degrees and pixels"
+
     def halves(self) -> tuple[Matrix, str]:
         """Return the identity, since only nuisances make the folds depend on each other, and the folds in words."""
-        splits, words = self.context.run.map.splits, "odd degrees, alternate pixels"
-        if len(splits) > 1:
-            words = f"{' and '.join(splits[1::2])} (frozen on {' and '.join(splits[::2])})"
+        words = "odd degrees, alternate pixels"
+        if len(self.context.run.map.splits) > 1:
+            words = "{1} (frozen on {0})".format(*self.folds)
         return half_given_other(self.context.ensemble), words
 
     def places(self) -> list[Place]:

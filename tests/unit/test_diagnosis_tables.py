@@ -21,6 +21,7 @@ from mcsim.diagnosis import api, report
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.measured_spectra import MeasuredSpectra
+from mcsim.diagnosis.naming import slices_of
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotate_biposh
@@ -256,6 +257,17 @@ def test_errors_that_the_model_does_not_have_are_noted(small, tmp_path):
     for factor, noted in ((1.0, 0), (3.0, 1), (np.nan, 0), (np.where(first, np.nan, 3.0), 1)):
         found = MeasuredSpectra(small, replace(spectra, error=factor * spread), lambda jobs: [])
         assert len(found.notes()) == noted
+
+
+def test_halves_of_a_table_are_bins_whatever_the_splits_of_the_maps(small, tmp_path):
+    spectra = read(tmp_path, measured(RUN))
+    model = small.analysis.model
+    run = replace(small.run, map=replace(small.run.map, splits=("half1", "half2")))
+    split = replace(small.analysis, model=replace(model, survey=replace(model.survey, config=run)))
+    for known in (small, replace(small, analysis=split)):
+        parts = slices_of(MeasuredSpectra(known, spectra, lambda jobs: []))
+        (found,) = (one for one in parts._divisions(small.candidates[0]) if one.kind == "halves")
+        assert found.words == ("every other bin", "the bins between")
 
 
 def test_correlated_bins_are_freed_of_what_others_predict(small, tmp_path):
