@@ -19,6 +19,12 @@ from mcsim.systematics import Effect, acts_through
 
 LARGE = 12  #: highest degree of the largest scales
 SPARE, SPARE_SHRUNK = 2.0, 1.25  #: simulations per element that a comparison needs; with a shrunk covariance
+FOLDS = {
+    "noise": ("even pixels", "odd pixels"),
+    "sky": ("even degrees", "odd degrees"),
+    "isotropy": ("lower degrees", "higher degrees"),
+}
+"""Folds of elements of no split, by their kind."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +176,8 @@ class Slices:
         for place, (candidate, action) in enumerate(zip(candidates, actions, strict=True)):
             others = [other.response for k, other in enumerate(actions) if k != place]
             beside = np.column_stack([free, *others])
-            divisions = (self._compared(one, action, beside) for one in self._divisions(candidate))
+            every = self._divisions(candidate, action.response)
+            divisions = (self._compared(one, action, beside) for one in every)
             own = [one for one in divisions if one is not None]
             if len(candidates) == 1 and not noisy:
                 own += self._of_maps(candidate.channel, action)
@@ -189,10 +196,18 @@ class Slices:
             (row, e) for row, e in found if e.statistic != "score" and (channel is None or set(e.channels) == {channel})
         ]
 
-    def _divisions(self, candidate: Candidate) -> Iterator[Division]:
+    def _folds(self, own: Sequence[tuple[int, Element]], response: Vector) -> tuple[str, str]:
+        """Return what the folds are in words, of the kind of elements in which a response shows most."""
+        sizes: dict[str, float] = {}
+        for row, e in own:
+            if e.fold is not None:
+                sizes[e.kind] = sizes.get(e.kind, 0.0) + float(response[row] / self.ensemble.spread[row]) ** 2
+        return FOLDS.get(max(sizes, key=lambda kind: sizes[kind], default=""), self.folds)
+
+    def _divisions(self, candidate: Candidate, response: Vector) -> Iterator[Division]:
         own, first = self._own(candidate.channel), len(self.z) - self.beside
         halves = [[row for row, e in own if e.fold == fold] for fold in (0, 1)]
-        yield _of_rows("halves", self.folds, halves)
+        yield _of_rows("halves", self._folds(own, response), halves)
         noisy = acts_through(candidate.effect, "noise")  # it shows in differences of splits, and in pixels
         ends = {e for e in (LARGE, max(LARGE, bins(2, self.lmax, 2)[0][1])) if e < self.lmax}
         edges = [e for _, e in scales(self.lmax)] if noisy else sorted({*ends, self.lmax})

@@ -76,7 +76,8 @@ def test_ranges_of_degrees_follow_one_another_to_the_last(lmax):
     """None starts behind its end, however few degrees the maps have."""
     empty = np.zeros((0, 0))
     nothing = NullEnsemble(empty, np.zeros(0), (), empty, empty, empty, empty, empty)
-    found = Slices(nothing, np.zeros(0), 0, ("half1", "half2"), lmax, DiagnosisSettings())._divisions(GAIN)
+    tested = Slices(nothing, np.zeros(0), 0, ("half1", "half2"), lmax, DiagnosisSettings())
+    found = tested._divisions(GAIN, np.zeros(0))
     (degrees,) = (one for one in found if one.kind == "degrees")
     ends = [tuple(map(int, word.removeprefix("ℓ ").split("–"))) for word in degrees.words]
     assert [first for first, _ in ends] == [0, *(last + 1 for _, last in ends[:-1])]
@@ -223,6 +224,8 @@ def test_more_noise_is_more_in_all_degrees_and_in_pixels():
         (own,) = (found := tested.findings([candidate], [action])).comparisons
         (degrees,) = (one for one in own if one.kind == "degrees")
         assert degrees.slices == ("ℓ 0–12", "ℓ 13–24", "single pixels")
+        # Differences of splits have both of them.
+        assert [one.slices for one in own if one.kind == "halves"] == [("even pixels", "odd pixels")]
         return found.contradict(DiagnosisSettings())
 
     assert not refused(white, 1.4)

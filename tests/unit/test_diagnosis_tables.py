@@ -266,7 +266,7 @@ def test_halves_of_a_table_are_bins_whatever_the_splits_of_the_maps(small, tmp_p
     split = replace(small.analysis, model=replace(model, survey=replace(model.survey, config=run)))
     for known in (small, replace(small, analysis=split)):
         parts = slices_of(MeasuredSpectra(known, spectra, lambda jobs: []))
-        (found,) = (one for one in parts._divisions(small.candidates[0]) if one.kind == "halves")
+        (found,) = (one for one in parts._divisions(small.candidates[0], small.templates[:, 0]) if one.kind == "halves")
         assert found.words == ("every other bin", "the bins between")
 
 
