@@ -307,7 +307,7 @@ class Refiner:
         """
         for factor in (1.0, 0.5):
             try:
-                effect = candidate.detected(factor * coordinates, covariance / factor**2)
+                effect = candidate.detected(factor * coordinates, factor**2 * covariance)
                 tables = [candidate.table(effect)]
                 pair = None if stochastic else self.data.pair(tables)
                 changes = self.data.respond(tables, self._skies(stochastic)) if pair is None else pair[1] - pair[0]

@@ -10,6 +10,7 @@ from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.refine import Refiner
 from mcsim.diagnosis.selection import attribute
+from mcsim.errors import InputError
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate, global_test
 from mcsim.systematics import Effect, Parametrization
@@ -31,6 +32,13 @@ class Push(Effect):
 class Unconstrained(Parametrization):
     def constrained(self, coordinates, precision):
         return 0.0 * coordinates
+
+
+class Resolved(Parametrization):
+    """What is measured below five standard deviations counts as nothing."""
+
+    def constrained(self, coordinates, precision):
+        return coordinates * (coordinates @ precision @ coordinates > 25.0)
 
 
 class Instrument:
@@ -186,6 +194,22 @@ def test_what_data_tell_nothing_of_is_neither_detected_nor_simulated(monkeypatch
     assert found.attribution.verdict == "unknown"
     assert found.partial is None
     assert instrument.analysis == []
+
+
+def test_half_of_an_effect_that_cannot_be_whole_is_as_significant(monkeypatch):
+    """At half of the amplitude its error was four times that of this half, and what it has was no longer measured."""
+    instrument = Instrument(bend=0.0, cross=0.0)
+    respond, x = instrument.respond, instrument.response(12.0, 0.0)
+
+    def limited(tables, skies):
+        if float(tables[0].parameters["amplitude"]) > 10.0:
+            raise InputError("too large")
+        return respond(tables, skies)
+
+    monkeypatch.setattr(Push, "parametrization", Resolved())
+    monkeypatch.setattr(instrument, "respond", limited)
+    instrument.refined(x)
+    assert [amplitudes["A"] for amplitudes in instrument.analysis] == pytest.approx([6.0], abs=0.1)
 
 
 @pytest.mark.parametrize("enough", [3.0, 30.0], ids=["suffices alone", "does not"])
