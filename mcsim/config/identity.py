@@ -116,6 +116,7 @@ def _leaves(value: Any, key: str) -> list[tuple[str, str]]:
         return [leaf for name, item in value.items() for leaf in _leaves(item, f"{key}.{name}" if key else name)]
     if isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
         names = [str(item.get("name", number)) for number, item in enumerate(value)]
+        names = [name if names.count(name) == 1 else f"{name} {number}" for number, name in enumerate(names)]
         inner = [leaf for name, item in zip(names, value, strict=True) for leaf in _leaves(item, f"{key}[{name}]")]
         return [(f"{key} (order)", ", ".join(names)), *inner]
     if isinstance(value, str) and value.startswith("sha256:"):

@@ -109,6 +109,17 @@ def test_order_and_number_of_channels(plain, folder):
     assert 'channel[V1].beam.kind: "gaussian" -> absent' in found
 
 
+@pytest.mark.parametrize("changes", [(0,), (1,), (0, 1)])
+def test_all_effects_of_one_name_count(plain, folder, changes):
+    plain["effect"] = [{"name": "calibration", "channel": name, "amplitude": 0.01} for name in ("W1", "V1")]
+    old = config.science(config.load(plain))
+    for number in changes:
+        plain["effect"][number]["amplitude"] = 0.5
+    assert config.differences(old, config.science(config.load(plain))) == [
+        f"effect[calibration {number}].amplitude: 0.01 -> 0.5" for number in changes
+    ]
+
+
 def test_hash_covers_contents_of_files_and_not_their_place(plain, folder):
     digest = config.digest(config.load(plain))
     moved = folder / "elsewhere" / "renamed.toml"
