@@ -3,6 +3,7 @@
 import os
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from string import Formatter
 from typing import Any, NamedTuple
@@ -119,10 +120,10 @@ def find_descriptions(plain: dict[str, Any]) -> None:
         scan = channel.get("scan")
         if not isinstance(scan, dict) or scan.get("kind") != "moments" or scan.get("model") is not None:
             continue
-        path = str(scan.get("path")).replace("{channel}", str(channel.get("name")))
-        beside = Path(path).parent / DESCRIPTION
-        if os.path.isfile(beside):  # False also for a name that no file system takes
-            scan["model"] = str(beside)
+        with suppress(ValueError, LookupError):  # of placeholders that are refused afterwards
+            beside = channel_path(str(Path(str(scan.get("path"))).parent / DESCRIPTION), str(channel.get("name")))
+            if os.path.isfile(beside):  # False also for a name that no file system takes
+                scan["model"] = literal(str(beside))
 
 
 def files(entry: Entry, splits: Sequence[str], where: str, realization: int = 0) -> dict[str, Path]:

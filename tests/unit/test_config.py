@@ -31,12 +31,14 @@ def test_defaults(plain, folder):
     assert run.channels[1].scan.model == str(folder / "scan.toml")
 
 
-def test_the_description_of_a_scan_is_found_where_the_folder_names_its_channel(plain, folder):
-    (folder / "scans/V1").mkdir(parents=True)
+@pytest.mark.parametrize("base", ["scans", "scans of {2026}"])
+def test_the_description_of_a_scan_is_found_where_the_folder_names_its_channel(plain, folder, base):
+    (folder / base / "V1").mkdir(parents=True)
     for name in ("scan.toml", "moments.npz"):
-        (folder / "scans/V1" / name).write_text("contents")
-    plain["channel"][1]["scan"] = {"kind": "moments", "path": "scans/{channel}/moments.npz"}
-    assert config.load(plain).channels[1].scan.model == str(folder / "scans/V1/scan.toml")
+        (folder / base / "V1" / name).write_text("contents")
+    plain["channel"] = [plain["channel"][1] | {"scan": {"kind": "moments", "path": "{channel}/moments.npz"}}]
+    model = config.load(plain, base=folder / base).channels[0].scan.model
+    assert config.channel_path(model, "V1") == folder / base / "V1/scan.toml"
 
 
 def test_the_file_of_a_nuisance_is_found_beside_the_configuration(plain, folder, monkeypatch):
