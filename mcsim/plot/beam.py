@@ -36,7 +36,7 @@ def beam_figure(beam: Beam, beam_map: BeamMap | None = None, title: str = "") ->
     figure = Figure(figsize=(15.0, 4.9), layout=ConstrainedLayoutEngine(wspace=0.06))
     peak_axes, faint_axes, blm_axes = figure.subplots(1, 3, width_ratios=[1, 1.12, 1.25])
     if title:
-        figure.suptitle(title, fontsize=13, fontweight="bold")
+        figure.suptitle(title, fontsize=13, fontweight="bold", parse_math=False)
     fwhm = summary.fwhm_major_arcmin if np.isfinite(summary.fwhm_major_arcmin) else np.degrees(0.5) * 60
     off_centre = float(np.hypot(*summary.centroid_arcmin))
     _draw_peak(peak_axes, beam, beam_map, summary, 1.25 * fwhm + off_centre)

@@ -22,7 +22,7 @@ def fit_figure(fits: Sequence[Fit]) -> Figure:
     columns = list(dict.fromkeys((row.mode, row.imaginary) for row in data.rows))
     figure = Figure(figsize=(4.4 * (len(columns) + 1), 5.4), layout="constrained")
     what = "spectra less those of the circular-beam control" if data.kind == "difference" else "spectra"
-    figure.suptitle(f"{data.origin}: {what}", fontsize=11)
+    figure.suptitle(f"{data.origin}: {what}", fontsize=11, parse_math=False)
     axes = figure.subplots(2, len(columns) + 1, height_ratios=(2.2, 1.0), squeeze=False)
     errors, scaling = np.sqrt(np.diag(data.covariance)), data.scaling
     quantity = r"\ell(\ell+1)A/2\pi" if scaling.spectrum else "A"

@@ -32,7 +32,7 @@ def scan_figure(moments: Moments, title: str = "", model: ScanModel | None = Non
     seen = np.asarray(moments.hits > 0.0)
     w2 = np.where(seen, moments.w[1], np.nan)
     figure = Figure(figsize=(11.0, 7.0), layout="constrained")
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)
     axes = figure.subplots(2, 2, height_ratios=(1.0, 0.8))
     _panel(axes[0, 0], np.degrees(-0.5 * np.angle(w2)), "twilight_shifted", 90.0, "degrees, modulo 180")
     axes[0, 0].set_title(r"mean orientation $\bar\psi = -\frac{1}{2}\,\arg w_2$")

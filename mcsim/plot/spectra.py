@@ -76,7 +76,7 @@ def _draw(modes: xr.Dataset, title: str, expected: xr.Dataset | None) -> Figure:
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(5.2 * columns, 3.6 * rows + 0.4), layout="constrained")
-    figure.suptitle(title, fontsize=11)
+    figure.suptitle(title, fontsize=11, parse_math=False)
     paired = "biposh_difference_binned_mean" in modes
     for number, (L, M) in enumerate(panels):
         axes = figure.add_subplot(rows, columns, number + 1)

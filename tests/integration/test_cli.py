@@ -138,6 +138,11 @@ def test_notes_of_a_wide_and_a_narrow_figure_are_whole(small_store: Path, chosen
     assert box.x1 <= whole.x1
 
 
+def test_a_name_that_looks_like_a_formula_is_drawn_as_it_is(small_store: Path, tmp_path: Path) -> None:
+    os.symlink(small_store, tmp_path / "a$_$b.zarr")
+    ensemble_figure(tmp_path / "a$_$b.zarr", L=2, M=0).savefig(io.BytesIO(), dpi=30)
+
+
 def test_one_realization_is_drawn_without_errors(client: Client, tmp_path: Path) -> None:
     runner.run(table(ensemble={"realizations": 1}), tmp_path / "one.zarr", workers=client)
     [axes] = ensemble_figure(tmp_path / "one.zarr", L=2, M=0, d=0).axes

@@ -106,7 +106,7 @@ def test_text_warns_of_a_beam_cut_at_lmax() -> None:
 def test_figure_has_its_panels(tmp_path, known_as) -> None:
     beam_map = drawn(30.0, 24.0, 20.0)
     beam = Beam.gaussian(30, 800) if known_as == "circular" else Beam.elliptical(30, 24, angle_deg=20, lmax=800)
-    figure = beam_figure(beam, beam_map if known_as == "map" else None, "a beam")
+    figure = beam_figure(beam, beam_map if known_as == "map" else None, "a$_$b")
     assert isinstance(figure, Figure)
     panels = [axes for axes in figure.axes if axes.get_title()]
     assert len(panels) == 3
