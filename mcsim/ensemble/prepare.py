@@ -1,5 +1,6 @@
 """Prepare observed maps as the maps of a run are prepared, by the same code."""
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
@@ -151,8 +152,8 @@ def prepare_files(source: Source, files: Sequence[str], folder: str | Path) -> l
 def _read(run: config.RunConfig, names: Mapping[str, str], file: str) -> tuple[str, Map]:
     """Return the name of a map of the run, and the map of a file in uK."""
     named, equals, path = file.partition("=")
-    if not equals:
-        path = file
+    if not equals or (named not in names and os.path.isfile(user_path(file))):
+        path, equals = file, ""
         named = next((name for name, own in names.items() if own == Path(file).name), "")
     if named not in names:
         known = ", ".join(names.values())

@@ -465,12 +465,12 @@ def test_files_are_prepared(tmp_path, rng):
     run = run_with({"kind": "degrade", "nside": COARSE})
     map_uk = rng.standard_normal(NPIX)
     healpy.write_map(tmp_path / "raw.fits", 1e-3 * map_uk, column_units="mK", coord="E", dtype=np.float64)
-    [path] = prepare_files(run, [f"V={tmp_path / 'raw.fits'}"], tmp_path / "out")
+    [path] = prepare_files(run, [f"V={tmp_path / 'raw.fits'}"], tmp_path / "run=3")
     found, frame, unit = healpix.read_map(path)
     assert found == pytest.approx(prepare(run, map_uk), rel=1e-9)
     assert (path.name, frame, unit) == ("V.fits", "ecliptic", "uK")
-    with refused(tmp_path / "out"):
-        prepare_files(run, [f"V={tmp_path / 'raw.fits'}"], tmp_path / "out")
+    with refused(tmp_path / "run=3"):
+        prepare_files(run, [f"V={tmp_path / 'raw.fits'}"], tmp_path / "run=3")
     with refused(tmp_path / "raw.fits", "V.fits"):
         prepare_files(run, [str(tmp_path / "raw.fits")], tmp_path / "other")
     with refused("V", "twice"):
@@ -479,12 +479,12 @@ def test_files_are_prepared(tmp_path, rng):
         prepare_files(run, [f"Q={tmp_path / 'raw.fits'}"], tmp_path / "other")
     for value in (np.inf, -np.inf):
         infinite = np.where(np.arange(NPIX) < 5, value, map_uk)
-        healpy.write_map(tmp_path / "V.fits", infinite, coord="E", overwrite=True, dtype=np.float64)
-        with refused(tmp_path / "V.fits", "5 pixels", "UNSEEN"):
-            prepare_files(run, [str(tmp_path / "V.fits")], tmp_path / "other")
-    healpy.write_map(tmp_path / "V.fits", map_uk, coord="G", overwrite=True, dtype=np.float64)
-    with refused(tmp_path / "V.fits", "map.frame", "galactic", "ecliptic"):
-        prepare_files(run, [str(tmp_path / "V.fits")], tmp_path / "other")
+        healpy.write_map(path, infinite, coord="E", overwrite=True, dtype=np.float64)
+        with refused(path, "5 pixels", "UNSEEN"):
+            prepare_files(run, [str(path)], tmp_path / "other")
+    healpy.write_map(path, map_uk, coord="G", overwrite=True, dtype=np.float64)
+    with refused(path, "map.frame", "galactic", "ecliptic"):
+        prepare_files(run, [str(path)], tmp_path / "other")
 
 
 def test_identity_of_a_run_has_its_preparation():
