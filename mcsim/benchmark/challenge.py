@@ -28,7 +28,7 @@ from mcsim.simulation import nuisance, sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import rng
 from mcsim.support.arrays import Vector
-from mcsim.support.folders import appearing, writable
+from mcsim.support.folders import appearing, user_path, writable
 from mcsim.support.progress import reporting
 
 SMALLER = 0.7  #: factor between one trial of an amplitude and the next
@@ -50,7 +50,7 @@ def make(
     """
     if cases < 1:
         raise InputError(f"a challenge of {cases} cases is none; ask for at least 1.")
-    target, file = Path(folder), settings.out_of_library
+    target, file = user_path(folder), settings.out_of_library
     if file is not None:
         settings = replace(settings, out_of_library=(file := str(Path(file).resolve())))
     # Cases are diagnosed from wherever that is asked for.
@@ -162,7 +162,7 @@ def run(folder: str | Path, *, workers: Workers | None = None, quiet: bool = Tru
     vector and the fits behind the verdict). ``workers`` as for :func:`make`.
     InputError if the folder holds no challenge, or cases that have keys are lost.
     """
-    target = Path(folder)
+    target = user_path(folder)
     missing = [case for case in files.all_cases(target) if not files.is_answered(target, case)]
     settings = Settings.read(target)
     if missing:

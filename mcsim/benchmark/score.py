@@ -50,7 +50,7 @@ def score(folder: str | Path, *, workers: Workers | None = None, quiet: bool = T
     that learn the model again, should it not be in the cache (:func:`mcsim.benchmark.challenge.make`). InputError if
     there is no verdict, or one cannot be read, or a key is not the sealed one, or cases that have keys are lost.
     """
-    target = Path(folder)
+    target = user_path(folder)
     not_a_file(target / "score")
     made = all_cases(target)
     cases = [case for case in made if is_answered(target, case)]

@@ -14,6 +14,7 @@ from mcsim.instrument import beams, scan
 from mcsim.plot.beam import beam_figure
 from mcsim.plot.scan import scan_figure
 from mcsim.simulation import channels
+from mcsim.support.folders import user_path
 from mcsim.support.progress import reporting
 
 LMAX = 2048  #: of the coefficients that are shown, by default
@@ -39,7 +40,7 @@ def look_at_beams(
     the beam, and ``pixel_deg``, the side of a pixel of a beam map in degrees, read from its header. InputError for what
     the source does not have, or says itself.
     """
-    path = Path(source)
+    path = user_path(source)
     if path.is_dir() or (not path.exists() and path.suffix not in ("", ".toml")):
         what = "is a folder" if path.is_dir() else "does not exist"
         raise InputError(f"{path} {what}; give a beam map or b_lm (FITS), or a configuration.")

@@ -264,3 +264,15 @@ def test_a_run_in_toml_loads_as_the_same_run(name):
     effect = config.Effect(name="beam_width", channel=run.channels[0].name, parameters={"amplitude": 0.01})
     run = replace(run, name=name, effects=(effect,))
     assert config.load(tomllib.loads(tomli_w.dumps(_without_none(config.to_dict(run))))) == run
+
+
+def test_a_folder_in_the_home_is_found_there(folder, monkeypatch):
+    monkeypatch.setenv("HOME", str(folder))
+    (folder / "file").write_text("")
+    settings = Settings(config.load("quickstart"))
+    with refused(folder / "file"):
+        make(settings, "~/file/of/mine", 1, 3)
+    (folder / VERDICTS / "case-000").mkdir(parents=True)
+    assert run("~") == 0
+    with refused(folder / MAPS / "case-000"):
+        score("~", workers=0)
