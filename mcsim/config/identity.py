@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from pathlib import Path
 from typing import Any
 
 from mcsim.config import paths
@@ -24,7 +25,7 @@ def science(config: RunConfig, *others: str) -> dict[str, Any]:
         if not entry.rule.checked:
             continue
         named = paths.files(entry, config.map.splits, config.name)
-        found = {label: f"sha256:{sha256_of(path)}" for label, path in named.items()}
+        found = {label: f"sha256:{_contents_of(path)}" for label, path in named.items()}
         contents: Any = found[""] if list(found) == [""] else found
         if "realization" in entry.rule.placeholders:
             contents = {"template": paths.template_tail(entry.template), "first": contents}
@@ -46,6 +47,14 @@ def science(config: RunConfig, *others: str) -> dict[str, Any]:
         },
         "ensemble": {key: plain["ensemble"][key] for key in ("seed", "paired")},
     }
+
+
+def _contents_of(path: Path) -> str:
+    if path.suffix != ".py":
+        return sha256_of(path)
+    from mcsim.support.code import file_digest  # loads slowly
+
+    return file_digest(path)
 
 
 _MAP = {
@@ -116,6 +125,7 @@ def _leaves(value: Any, key: str) -> list[tuple[str, str]]:
         return [leaf for name, item in value.items() for leaf in _leaves(item, f"{key}.{name}" if key else name)]
     if isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
         names = [str(item.get("name", number)) for number, item in enumerate(value)]
+        names = [str(number) if name.startswith("sha256:") else name for number, name in enumerate(names)]
         names = [name if names.count(name) == 1 else f"{name} {number}" for number, name in enumerate(names)]
         inner = [leaf for name, item in zip(names, value, strict=True) for leaf in _leaves(item, f"{key}[{name}]")]
         return [(f"{key} (order)", ", ".join(names)), *inner]

@@ -48,6 +48,16 @@ def _package_digest(packages: tuple[str, ...], libraries: tuple[str, ...]) -> st
     return _digest(files, *(f"{name} {version(name)}" for name in libraries))
 
 
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a Python file, and of what it imports from its own folder, directly or not."""
+    try:
+        files = _with_imports([path])
+    except (SyntaxError, ValueError):  # who runs it will say so
+        files = [path]
+    own = hashlib.sha256(path.read_bytes()).hexdigest()
+    return own if files == [path] else _digest(files)
+
+
 def class_digest(kind: type | FunctionType) -> str:
     """Return the SHA-256 of the packages of a user that define a function, or a class and its bases.
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from mcsim import config
+from mcsim.config import arrays
 from mcsim.support import resources
 from refusals import refused
 
@@ -154,6 +155,21 @@ def test_hash_covers_the_scan_model_that_an_effect_names(plain, folder, key):
     assert science("wmap")[1] == "wmap"
     with refused("real.tom", "planck"):
         science("real.tom")
+
+
+def test_hash_covers_what_an_effect_of_ones_own_imports_from_its_folder(plain, folder):
+    plain["effect"] = [{"name": "mine.py", "amplitude": 0.01}]
+    Path("mine.py").write_text("import alone")
+    alone = config.science(config.load(plain))["effect"][0]["name"]
+    assert alone == f"sha256:{arrays.sha256_of(Path('mine.py'))}"
+    Path("mine.py").write_text("from factor import FACTOR")
+    Path("factor.py").write_text("FACTOR = 1.0")
+    before = config.science(config.load(plain))
+    Path("factor.py").write_text("FACTOR = 10.0")
+    (difference,) = config.differences(before, config.science(config.load(plain)))
+    assert difference.startswith("effect[0].name: contents sha256:")
+    Path("mine.py").write_text("no Python")
+    assert config.digest(config.load(plain))
 
 
 def test_hash_covers_every_file_of_a_template(plain, folder):
