@@ -8,7 +8,7 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 def measured(value: float, sigma: float = 0.0, symbol: str = "") -> str:
     """Return a value with its error and the symbol of the unit behind each, rounded as the Particle Data Group does.
 
-    The error has two digits where they are below 36, else one.
+    The error has two digits where they are below 36, else one; digits before the point all stay.
 
     ``value``, ``sigma``: in the unit; without a positive, finite error the value has three digits. ``symbol``: of the
     unit, with the space before it where one belongs there.
