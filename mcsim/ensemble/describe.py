@@ -22,7 +22,8 @@ def describe(path: str | Path) -> str:
     target = user_path(path)
     attributes = store.attributes(target)
     done = store.done(target)
-    files = [file for file in target.rglob("*") if file.is_file()]
+    # What a run is writing at the moment may be gone at the next.
+    files = [file for file in target.rglob("*") if file.suffix != ".partial" and file.is_file()]
     with opening.open_ensemble(target) as ensemble:
         sizes = dict(ensemble.sizes)
         pairs = [str(pair) for pair in ensemble["pair"].values]

@@ -24,7 +24,7 @@ from astropy.table import Table
 from distributed import Client, LocalCluster
 
 from mcsim import cli, config, open_summary
-from mcsim.ensemble import runner, tables
+from mcsim.ensemble import describe, opening, runner, tables
 from mcsim.ensemble.maps import write_map
 from mcsim.ensemble.prediction import predict
 from mcsim.plot.spectra import ensemble_figure
@@ -136,6 +136,16 @@ def test_notes_of_a_wide_and_a_narrow_figure_are_whole(small_store: Path, chosen
     box, whole = figure.get_tightbbox(), figure.bbox_inches
     assert box.x0 >= 0.0
     assert box.x1 <= whole.x1
+
+
+def test_a_store_that_a_run_writes_is_described(
+    small_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(small_store, tmp_path / "small.zarr")
+    (half := tmp_path / "small.zarr/cl/zarr.ab.partial").write_bytes(b"")
+    opened = opening.open_ensemble
+    monkeypatch.setattr(opening, "open_ensemble", lambda path: (half.unlink(), opened(path))[1])
+    assert "realizations finished" in describe.describe(tmp_path / "small.zarr")
 
 
 def test_a_name_that_looks_like_a_formula_is_drawn_as_it_is(small_store: Path, tmp_path: Path) -> None:
