@@ -24,10 +24,10 @@ def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
     if map_.shape != (12 * model.nside**2,):
         size = healpy.npix2nside(map_.size) if map_.ndim == 1 and healpy.isnpixok(map_.size) else None
         found = f"the shape {map_.shape}" if size is None else f"nside {size}"
-        raise InputError(
-            f"{name} has {found}, the model {model.nside}; set map.nside of the model to that of the data, or say in "
-            "[[preparation]] how they were degraded."
-        )
+        remedy = "set map.nside of the model to that of the data, or say in [[preparation]] how they were degraded"
+        if model.survey.config.preparation and size == model.survey.config.map.nside:
+            remedy = "do to the data what [[preparation]] does to simulations (mcsim prepare)"
+        raise InputError(f"{name} has {found}, the model {model.nside}; {remedy}.")
     broken = int(np.sum(~np.isfinite(map_)))
     if broken:
         raise InputError(f"{name} has {broken} pixels that are not finite; mark what was not observed as UNSEEN.")

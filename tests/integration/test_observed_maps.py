@@ -101,6 +101,13 @@ def test_hostile_data_end_in_a_sentence(small, folder, change, options, named):
         read_maps(small.model, folder)
 
 
+def test_maps_that_are_still_to_be_prepared_are_told_how(small, folder):
+    coarse = {"preparation": [{"kind": "degrade", "nside": 8}], "biposh": {"L_max": 2, "lmax": 20}}
+    model = model_of(survey(config.load(two_channels("small") | coarse)), DiagnosisSettings())
+    with refused("V1_half1.fits", "nside 16", 8, "prepare"):
+        read_maps(model, folder)
+
+
 def test_one_map_under_two_names_is_refused(small, folder):
     """Unless the model has no noise, by which alone halves need differ."""
     shutil.copy(folder / "V1_half1.fits", folder / "V1_half2.fits")
