@@ -20,7 +20,7 @@ from mcsim.comparison.description import (
 )
 from mcsim.comparison.missing import not_compared, warn_of_effects
 from mcsim.comparison.result import NotCompared
-from mcsim.comparison.scene import Maps, PointingFiles, Scene, scene_of
+from mcsim.comparison.scene import Maps, PointingFiles, Scene, files_of, maps_of_files, scene_of
 from mcsim.comparison.sky_of_maps import sky_in
 from mcsim.ensemble.external import named_source, source_of
 from mcsim.ensemble.maps import file_names, first_realization
@@ -165,7 +165,7 @@ def read(
     sides = [_side(side, run, described, nthreads) for side in (a, b)]
     for own, other, side in ((0, 1, a), (1, 0, b)):
         if not Path(side).is_dir() and _made_elsewhere((b, a)[own]):
-            sides[own] = _closer(sides[own], sides[other], config.load(side), nthreads)
+            sides[own] = _closer(sides[own], sides[other], side, nthreads)
     if run is None:
         groups = {name: [name] for name in sides[0] if name in sides[1]}
     else:
@@ -177,7 +177,8 @@ def read(
         )
     found = (_pair(name, maps, sides, whole, nthreads) for name, maps in groups.items())
     pairs = (replace(pair, orders=orders.get(pair.name)) for pair in found)
-    noisy = (pair if run is None else _with_noise(pair, run) for pair in pairs)
+    drawn = run if run is None or any(map(_made_elsewhere, (a, b))) else quiet(run)
+    noisy = (pair if drawn is None else _with_noise(pair, drawn) for pair in pairs)
     own_first = tuple(pair.exchanged() if of_b else pair for pair in noisy)
     return Comparison(own_first, run, not_compared((a, b), sides, run), of_b)
 
@@ -258,7 +259,7 @@ def _side(
     path = Path(side)
     if path.is_dir():
         return _folder(path, run, described)
-    own, external = named_source(config.load(side))
+    own, external = _named(side)
     check_splits(own)
     wanted = own_frame = config.prepared_grid(own)[1]
     if run is not None:
@@ -272,6 +273,12 @@ def _side(
         return _external(quiet(own), external, nthreads)
     shared = survey(with_known_offsets(own), nthreads)
     return dict(zip(shared.map_names, simulate.maps(shared, 0, nthreads), strict=True))
+
+
+def _named(side: str | Path) -> tuple[config.RunConfig, str | None]:
+    """Return the run that a side is, without noise, and the simulator or stored maps that it names, if any."""
+    run, external = named_source(config.load(side))
+    return replace(run, channels=tuple(channel.without_noise() for channel in run.channels)), external
 
 
 def _external(own: config.RunConfig, given: str, nthreads: int) -> dict[str, NDArray[np.float64]]:
@@ -288,14 +295,14 @@ def _external(own: config.RunConfig, given: str, nthreads: int) -> dict[str, NDA
 
 
 def _closer(
-    made: dict[str, NDArray[np.float64]], wanted: dict[str, NDArray[np.float64]], run: config.RunConfig, nthreads: int
+    made: dict[str, NDArray[np.float64]], wanted: dict[str, NDArray[np.float64]], side: str | Path, nthreads: int
 ) -> dict[str, NDArray[np.float64]]:
     """Return the maps of a run as they were made, or those that are closer to the other side's, but for a factor.
 
     Orientation moments spread samples over their pixels otherwise than another simulator does, which may have all
     orders of a beam too.
     """
-    run, external = named_source(run)
+    run, external = _named(side)
     if external is not None:
         return made
     full = with_all_orders(run)
@@ -326,7 +333,7 @@ def _by_samples(run: config.RunConfig, nthreads: int) -> dict[str, NDArray[np.fl
     whole = survey(run, nthreads)
     pointings = [channel.site.pointing for channel in whole.making.channels]
     if any(p is None or p.model.samples(p.line) > SAMPLES for p in pointings):
-        return None
+        return maps_of_files(whole, HELD, nthreads)
     try:
         return dict(sampled.maps(whole, 0, nthreads))
     except InputError:  # an effect on orientation moments, say
@@ -419,12 +426,8 @@ def _pair(
     named = sky.alm is not None or sky.map is not None
     truth = simulate.draw_sky(whole, 0) if named else np.zeros(alm_.size(sky.lmax), complex)
     scene = scene_of(channel, whole.config.map, truth, nthreads)
-    files = None
     spec = next(c for c in whole.config.channels if c.name == name)
-    if isinstance(spec.scan, config.ScanPointing):
-        splits = whole.config.map.splits or (None,)
-        paths = tuple(config.channel_path(spec.scan.path, name, split) for split in splits)
-        files = PointingFiles(paths, channel.site.frame)
+    files = files_of(whole.config, spec, channel.site.frame)
     pair = ChannelPair(name, tuple(maps), a, b, seen, absent, one_sided, scene, channel, hits, usable, not named, files)
     # Parallel transport is said of pixels' centres: there are no samples that a simulator could have elsewhere.
     pair = replace(pair, by_moments=isinstance(spec.scan, config.ScanParallelTransport))

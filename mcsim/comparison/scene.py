@@ -16,10 +16,10 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.user_pointing import blocks_of_files
-from mcsim.simulation import convolve, sampled, tod
+from mcsim.simulation import convolve, sampled, simulate, tod
 from mcsim.simulation.offsets import expansion, offset_maps
 from mcsim.simulation.preparation import Preparation
-from mcsim.simulation.survey import Channel
+from mcsim.simulation.survey import Channel, Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.support.arrays import Alm
@@ -278,3 +278,31 @@ def scene_of(channel: Channel, grid: config.Map, sky: Alm, nthreads: int) -> Sce
     spans = tuple(map(grid.span, range(len(moments))))
     preparations = tuple(m.preparation for m in channel.maps if m.preparation is not None)
     return Scene(sky, channel.site.beam, channel.window, moments, preparations, nthreads, spans)
+
+
+def files_of(run: config.RunConfig, spec: config.Channel, frame: str) -> PointingFiles | None:
+    """Return the samples of a channel whose scan is a file of them; None for other scans."""
+    if not isinstance(spec.scan, config.ScanPointing):
+        return None
+    splits = run.map.splits or (None,)
+    return PointingFiles(tuple(config.channel_path(spec.scan.path, spec.name, split) for split in splits), frame)
+
+
+def maps_of_files(whole: Survey, longest: float, nthreads: int) -> dict[str, Maps] | None:
+    """Return the maps of a survey sample by sample by name, if all samples are in files and there are no effects.
+
+    None otherwise, with a preparation, and where a channel has more samples than ``longest``.
+    """
+    run = whole.config
+    pairs = list(zip(run.channels, whole.channels, strict=True))
+    files = [files_of(run, spec, channel.site.frame) for spec, channel in pairs]
+    number = max(sum(m.moments.hits.sum() for m in channel.maps) for channel in whole.channels)
+    if None in files or run.effects or run.preparation or number > longest:
+        return None
+    sky, found = simulate.draw_sky(whole, 0), {}
+    for channel, own in zip(whole.channels, files, strict=True):
+        assert own is not None
+        scene = scene_of(channel, run.map, sky, nthreads)
+        for m, made in zip(channel.maps, scene.sampled(own, scene.window), strict=True):
+            found[m.name] = np.where(m.moments.hits > 0, made, healpy.UNSEEN)
+    return found

@@ -125,7 +125,8 @@ def refuse_external(run: config.RunConfig) -> None:
         key = "ensemble.maps" if run.simulator is None else "simulator"
         given = run.simulator or run.ensemble.maps
         raise InputError(
-            f"{run.name} has {key} = {given!r}, which only a diagnosis of maps takes; remove it to simulate with mcsim."
+            f"{run.name} has {key} = {given!r}, which only a diagnosis or a comparison of maps takes; remove it to "
+            "simulate with mcsim."
         )
 
 
