@@ -64,7 +64,9 @@ def merge(
 
 def info(
     store: Store,
-    export: Annotated[Path | None, Option(metavar="FILE", help="Write the summary: .nc, .zarr or .ecsv.")] = None,
+    export: Annotated[
+        Path | None, Option(metavar="FILE", help="Write the summary: .nc or .zarr; .ecsv, .fits or .csv.")
+    ] = None,
     verify: Annotated[bool, Option("--verify", help="Read every file; exit code 1 if anything is damaged.")] = False,
 ) -> None:
     """Describe a store; export its summary; verify it."""
@@ -121,7 +123,9 @@ def predict(
     config: Config,
     exact: Annotated[bool, Option("--exact", help="To all orders in the beam; default: leading order.")] = False,
     snr: Annotated[bool, Option("--snr", help="Add the signal to noise of every mode.")] = False,
-    output: Annotated[Path | None, Option("-o", "--output", metavar="FILE", help=".zarr, .nc or .ecsv.")] = None,
+    output: Annotated[
+        Path | None, Option("-o", "--output", metavar="FILE", help=".zarr or .nc; .ecsv, .fits or .csv.")
+    ] = None,
     workers: Annotated[int | None, Option(min=1, help="Local processes, for the pairs of maps; default: one.")] = None,
     scheduler: Scheduler = None,
 ) -> None:

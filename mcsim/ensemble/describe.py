@@ -45,7 +45,8 @@ def describe(path: str | Path) -> str:
         names = [f"biposh{kind}_binned_{what}" for what in ("mean", "standard_error")]
         with opening.open_summary(target) as summary:
             rows = list(strongest(opening.read_in(summary[names], target), kind).head(5).itertuples())
-        found += ["  strongest binned spectra (mean over error):"] if rows else []
+        what = "mean of the difference to the control over its error" if paired else "mean over error"
+        found += [f"  strongest binned spectra ({what}):"] if rows else []
         for row in rows:
             bounds = f"l = {row.bin_first}-{row.bin_last}"
             found.append(f"    {row.pair}  {row.mode:8s} {bounds:14s} {_value(row.value)} uK^2, {row.sigma:.1f} sigma")

@@ -9,12 +9,14 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pandas as pd
 import xarray as xr
+from astropy.io.fits.verify import VerifyWarning
 from astropy.table import Table
 
 from mcsim.errors import InputError
 from mcsim.support.folders import unreadable, unwritable, user_path, writable
 
 ENDINGS = (".zarr", ".nc", ".ecsv")  #: of files of summaries and predictions: Zarr, NetCDF, a table of bins
+TABLES = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}  #: astropy's formats of tables by ending
 
 
 def spectra(summary: xr.Dataset, kind: str) -> pd.DataFrame:
@@ -73,9 +75,10 @@ def table(summary: xr.Dataset) -> Table:
 def check_output(output: str | Path) -> None:
     """Raise InputError unless :func:`write` can write a file of this name, and knows the kind that it asks for."""
     ending = Path(output).suffix
-    if ending not in ENDINGS:
+    if ending not in (*ENDINGS, *TABLES):
         raise InputError(
-            f"{output} ends in {ending or 'nothing'}; choose .zarr, .nc (NetCDF) or .ecsv (table of bins)."
+            f"{output} ends in {ending or 'nothing'}; choose .zarr, .nc (NetCDF), or .ecsv, .fits or .csv (table of "
+            "bins; mcsim reads .ecsv again)."
         )
     target = user_path(output)
     if target.exists():
@@ -84,9 +87,10 @@ def check_output(output: str | Path) -> None:
 
 
 def write(summary: xr.Dataset, output: str | Path) -> None:
-    """Write a summary or a prediction as Zarr (``.zarr``) or NetCDF (``.nc``), or its binned spectra (``.ecsv``).
+    """Write a summary or a prediction as Zarr (``.zarr``) or NetCDF (``.nc``), or its binned spectra as a table.
 
-    What is named ``output`` is complete, or is not there.
+    A table is ``.ecsv``, ``.fits``, or ``.csv``, which has no header of units and normalisation. What is named
+    ``output`` is complete, or is not there.
     """
     check_output(output)
     target = user_path(output)
@@ -107,7 +111,9 @@ def _write(summary: xr.Dataset, target: Path) -> None:
     elif target.suffix == ".nc":
         _for_netcdf(summary).to_netcdf(target, engine="scipy")
     else:
-        table(summary).write(target, format="ascii.ecsv")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", category=VerifyWarning)  # names in the header are longer than eight letters
+            table(summary).write(target, format=TABLES[target.suffix])
 
 
 def _for_netcdf(summary: xr.Dataset) -> xr.Dataset:

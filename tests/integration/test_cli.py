@@ -68,7 +68,7 @@ def test_help_prints_what_is_written(mcsim: Command, command: Callable[..., None
 def test_info_and_exports(mcsim: Command, small_store: Path, tmp_path: Path) -> None:
     code, out, _ = mcsim("info", small_store, "--export", "summary.nc")
     assert code == 0
-    assert unnamed(out, "10 of 10", "L2M0d0") == []
+    assert unnamed(out, "10 of 10", "L2M0d0", "control") == []
     with xr.open_dataset(tmp_path / "summary.nc", engine="scipy") as summary:
         assert summary["biposh_mean_re"].attrs["units"] == "uK^2"
         assert int(summary["count"]) == 10
@@ -77,6 +77,13 @@ def test_info_and_exports(mcsim: Command, small_store: Path, tmp_path: Path) -> 
     assert set(rows.colnames) >= {"pair", "L", "M", "d", "ell_min", "ell_max", "value", "error"}
     assert str(rows["value"].unit) == "uK2"
     assert "Bennett" in rows.meta["normalisation"]
+    for name in ("summary.fits", "summary.csv"):
+        code, _, err = mcsim("info", small_store, "--export", name)
+        assert (code, "Warning" in err) == (0, False)
+        same = Table.read(tmp_path / name)
+        assert same.colnames == rows.colnames
+        np.testing.assert_allclose(same["value"], rows["value"], rtol=1e-14)
+    assert str(Table.read(tmp_path / "summary.fits")["value"].unit) == "uK2"
     assert_refused(mcsim("info", small_store, "--export", "summary.ecsv"), "summary.ecsv", "another")
 
 
