@@ -1,7 +1,9 @@
-"""The documented walk through a stored ensemble, executed, and held against the summary that the run made."""
+"""The documented walk through a stored ensemble, and the examples of the documentation, executed."""
 
 import importlib.util
+import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -70,3 +72,13 @@ def test_the_recipe_of_the_tutorial_finds_a_signal_in_either_part(small_store: P
     found = names["z"]
     assert float(found.sel(mode=mode)) == pytest.approx(123.0)
     assert float(found.sum()) == pytest.approx(123.0)
+
+
+def test_the_tests_of_the_examples_pass_in_their_folder() -> None:
+    """As for who copies them: without the options of this project."""
+    folder = Path(__file__).parents[2] / "docs" / "howto"
+    tests = sorted(folder.glob("test_*.py"))
+    assert len(tests) >= 2
+    command = [sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "-p", "no:cacheprovider", *map(str, tests)]
+    found = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stdout
