@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,13 +45,6 @@ CODE = ("config", "sphere", "stats", "instrument", "systematics", "bipolar", "si
 EXTERNAL = ("external", "external_maps")  #: modules of ``ensemble`` by which those of another simulator are read
 
 
-class Computing(TypedDict, total=False):
-    """Keywords of :func:`diagnose` on which no result depends."""
-
-    quiet: bool
-    workers: Workers | None
-
-
 def diagnose(
     model: str | Path | Mapping[str, Any] | config.RunConfig | ExternalModel,
     data: str | Path | Sequence[NDArray[np.float64]] | Mapping[str, NDArray[np.float64]],
@@ -59,7 +52,8 @@ def diagnose(
     *,
     case: str | None = None,
     settings: DiagnosisSettings | None = None,
-    **computing: Unpack[Computing],
+    quiet: bool = True,
+    workers: Workers | None = None,
 ) -> DiagnosisResult:
     """Diagnose the gap between a simulation and data.
 
@@ -79,10 +73,11 @@ def diagnose(
     settings
         Library of effects, those that are no candidates, levels, cuts, bins, numbers of simulations and of controls;
         default: those of :class:`~mcsim.datavector.settings.DiagnosisSettings`.
-    **computing
-        ``quiet`` (default True): report no progress. ``workers``: number of processes that simulate, 0 for this one
-        (default: the ``compute.workers`` of the run); or the address of a running Dask scheduler, or a
-        ``distributed.Client``, whose workers share the file system.
+    quiet
+        Report no progress.
+    workers
+        Number of processes that simulate, 0 for this one; default: the ``compute.workers`` of the run. Or the address
+        of a running Dask scheduler, or a ``distributed.Client``, whose workers share the file system.
 
     Returns
     -------
@@ -98,7 +93,6 @@ def diagnose(
     RunError
         If a simulator of another program fails; the same call goes on where it ended.
     """
-    quiet, workers = _computing(**computing)
     run, source = loaded(model)
     settings = settings_of(settings, DiagnosisSettings)
     wanted, (settings, library, asked) = settings.controls, _with_library(settings)
@@ -130,7 +124,7 @@ def diagnose(
             )
             if source is not None:
                 campaign.check_data(found.x, ensemble, source)
-            diagnosis = diagnose_data(found, case or run.name)
+            diagnosis = diagnose_data(found, str(case or run.name))
         if diagnosis.kind == "unknown" and isinstance(found, ObservedMaps) and source is None:
             with asking(call, quiet, simulated_scores.scores, "simulations of what is not listed") as ask:
                 diagnosis = unlisted.reconstructed(diagnosis, found, ask)
@@ -229,10 +223,6 @@ def _analysed(
         )
     power.check(analysis.model.survey)
     return run, analysis, table
-
-
-def _computing(quiet: bool = True, workers: Workers | None = None) -> tuple[bool, Workers | None]:
-    return quiet, workers
 
 
 def _with_agreement(diagnosis: DiagnosisResult, found: Agreement) -> DiagnosisResult:

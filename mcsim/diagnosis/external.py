@@ -94,18 +94,17 @@ def agreement(known: DiagnosisContext) -> Agreement:
         least = min(test.pvalue, scatter, 1.0 - 1e-12)
         found.append((float(-np.expm1(2.0 * np.log1p(-least))), test.best, mean))
     pvalue, best, mean = max(found, key=lambda one: one[0])
-    nearest = None
-    if known.candidates:
-        # What the external simulations have and mcsim's lack.
-        there = 2.0 * null.mean - mean
-        fit = null.fit(there, known.templates[:, list(known.candidates[best].columns)])
-        try:
-            ((_, theta, covariance),) = parts_of(known.candidates, (best,), fit)
-            found_there = known.candidates[best].fitted(theta, covariance)
-            # From responses to small steps: without an error, which a large one has beyond that of the noise.
-            nearest = f"{known.candidates[best].title} (about {found_there.describe()})"
-        except InputError:
-            nearest = known.candidates[best].title
+    # What the external simulations have and mcsim's lack.
+    there = 2.0 * null.mean - mean
+    fit = null.fit(there, known.templates[:, list(known.candidates[best].columns)])
+    nearest = known.candidates[best].title
+    try:
+        ((_, theta, covariance),) = parts_of(known.candidates, (best,), fit)
+        found_there = known.candidates[best].fitted(theta, covariance)
+        # From responses to small steps: without an error, which a large one has beyond that of the noise.
+        nearest += f" (about {found_there.describe()})"
+    except InputError:
+        pass
     accepted = tuple(name for name in source.effects if name in {one.name for one in known.candidates})
     level = known.settings.agreement_level
     return Agreement(source.label, pvalue, pvalue > level, len(ensemble.reference), nearest, accepted)
