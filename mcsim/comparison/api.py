@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from mcsim.comparison.search import INTERPOLATING, Problem
 from mcsim.comparison.shown_sky import adds_orders, with_fewer_orders, with_shown_sky
 from mcsim.errors import InputError
 from mcsim.sphere import healpix
+from mcsim.sphere.checks import check_number
 from mcsim.support import folders
 from mcsim.support.progress import reporting
 
@@ -98,8 +99,15 @@ def compare(
     >>> found.verdict
     'identical'
     """
+    check_number(accuracy, "accuracy", "shares of the sky")
     if not 0.0 < accuracy < 1.0:
         raise InputError(f"accuracy = {accuracy:g} is no share of the sky; give a number between 0 and 1.")
+    for side in (a, b):
+        if not isinstance(side, str | Path | Mapping | Sequence | np.ndarray):
+            raise InputError(
+                f"a side is a {type(side).__name__}; give the path of a folder of maps or of a configuration, or "
+                "arrays by name or in the order of the model's maps."
+            )
     nthreads = os.cpu_count() or 1
     a, b = (folders.user_path(side) if isinstance(side, str | Path) else side for side in (a, b))
     if output is not None:

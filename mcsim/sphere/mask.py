@@ -41,8 +41,13 @@ def read_mask(
             f"{path} says that it is in {stated} coordinates, map.mask_frame is {mask_frame}; correct one of them."
         )
     mask_frame = mask_frame or stated or frame
-    if not (np.all(np.isfinite(mask)) and mask.min() >= 0.0 and mask.max() <= 1.0):
-        raise InputError(f"{path} has values outside 0 ... 1; a mask is a map of weights, 1 where the sky is used.")
+    wrong = np.flatnonzero(~((mask >= 0.0) & (mask <= 1.0)))
+    if wrong.size:
+        value = "UNSEEN" if mask[wrong[0]] == healpy.UNSEEN else f"{mask[wrong[0]]:g}"
+        raise InputError(
+            f"{path} has values outside 0 ... 1 ({wrong.size} pixels, first {wrong[0]}: {value}); a mask is a map of "
+            "weights, 1 where the sky is used and 0 where it is not."
+        )
     if found < nside:
         mask = healpy.ud_grade(mask, nside)
     if mask_frame != frame:

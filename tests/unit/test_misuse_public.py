@@ -248,6 +248,18 @@ def test_an_effect_without_amplitude_is_warned_of() -> None:
         check_effects(mcsim.load_config(run(effect=[{"name": "calibration", "channel": "W"}])))
 
 
+@pytest.mark.parametrize("side", [None, 5, mcsim.load_config("tiny")], ids=["none", "number", "run"])
+def test_a_side_of_another_type_is_refused(side) -> None:
+    with refused(type(side).__name__):
+        mcsim.compare(side, side, mcsim.load_config("tiny"))
+
+
+@pytest.mark.parametrize("accuracy", ["x", None, True, 0.0, 1.0])
+def test_an_accuracy_that_is_no_share_is_refused(accuracy) -> None:
+    with refused("accuracy", repr(accuracy) if isinstance(accuracy, str) else accuracy):
+        mcsim.compare([], [], mcsim.load_config("tiny"), accuracy=accuracy)
+
+
 @pytest.mark.parametrize(("smax", "warned"), [(2, True), (3, False)])
 def test_orders_that_a_file_of_moments_lacks_are_warned_of(smax, warned, tmp_path: Path) -> None:
     """A coma has m = 1 and 3: without the latter its response is another one."""
