@@ -59,8 +59,10 @@ _COVARIANCE, _RESPONSE = (0x6D63 * 1_000 + stream for stream in (1, 2))
 def batch(workers: runner.Workers) -> Iterator[Batch]:
     """Open a cluster of ``workers`` processes at the first call; with 0 call in this process.
 
-    ``workers`` may be the address of a running scheduler, which is called at once, or a client.
+    ``workers`` may be the address of a running scheduler, which is called at once, or a client; InputError for others.
     """
+    if workers != 0:
+        runner.check_workers(workers)
     with ExitStack() as stack:
         if not isinstance(workers, int):
             workers = stack.enter_context(runner.connected(workers))

@@ -11,6 +11,7 @@ from mcsim import config
 from mcsim.datavector import campaign
 from mcsim.datavector.analysis import Analysis, Job, analysis_of
 from mcsim.datavector.settings import DiagnosisSettings
+from refusals import refused
 
 
 @pytest.fixture(scope="module")
@@ -84,3 +85,10 @@ def test_without_a_share_of_opposite_steps_none_is_simulated(four: Analysis) -> 
     assert {(purpose.number, purpose.sign) for purpose in jobs if purpose.kind == "response"} == {
         (column, one.parametrization.sign or 1) for one in four.candidates for column in one.columns
     }
+
+
+@pytest.mark.parametrize("workers", [-2, 1.5, True])
+def test_workers_that_are_none_are_refused_though_nothing_is_to_be_simulated(workers: float) -> None:
+    """They were not looked at where the model was in the cache."""
+    with refused("workers", workers), campaign.batch(workers):
+        pass

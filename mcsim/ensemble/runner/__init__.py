@@ -5,7 +5,7 @@ loads beams and moments once.
 """
 
 from mcsim.ensemble.runner.batch import Result, run
-from mcsim.ensemble.runner.cluster import Workers, completed, connected, load_ahead, local_client
+from mcsim.ensemble.runner.cluster import Workers, check_workers, completed, connected, load_ahead, local_client
 from mcsim.ensemble.runner.slices import merge
 
-__all__ = ["Result", "Workers", "completed", "connected", "load_ahead", "local_client", "merge", "run"]
+__all__ = ["Result", "Workers", "check_workers", "completed", "connected", "load_ahead", "local_client", "merge", "run"]
