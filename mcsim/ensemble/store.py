@@ -260,7 +260,8 @@ def attributes(path: Path) -> dict[str, Any]:
     try:
         found = dict(_open(path).attrs)
     except _FAULTS as error:
-        raise InputError(f"{path} is not an ensemble store; name the folder that mcsim run wrote.") from error
+        what = "is not an ensemble store" if path.exists() else "does not exist"
+        raise InputError(f"{path} {what}; name the folder that mcsim run wrote.") from error
     if "science" not in found:
         raise InputError(f"{path} is a Zarr group but not an ensemble store; name the folder that mcsim run wrote.")
     return found

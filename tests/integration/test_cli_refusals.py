@@ -22,7 +22,7 @@ from .conftest import SMALL, Command, assert_refused
         (("run", "quickstart", "--resume"), ("quickstart.zarr", "--resume")),
         (("run", "quickstart", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"), ("--workers", "--scheduler")),
         (("run", "quickstart", "-o", "/proc/x.zarr"), ("/proc/x.zarr", "-o")),
-        (("info", "nothing.zarr"), ("nothing.zarr",)),
+        (("info", "nothing.zarr"), ("nothing.zarr", "exist")),
         (("plot", "nothing.zarr"), ("nothing.zarr",)),
         (("merge", "nothing.zarr", "-o", "x.zarr"), ("nothing.zarr",)),
         (("scan", "no-such-scan"), ("no-such-scan", "planck")),
