@@ -117,7 +117,7 @@ def fit(
     kind: Annotated[str | None, Option(help="plain, or difference to the controls, the default where known.")] = None,
     order: Annotated[str, Option(help="leading, exact, or auto: exact where the data tell them apart.")] = "auto",
     covariance: Annotated[Path | None, Option(metavar="STORE", help="Covariance of one of its realizations.")] = None,
-    knots: Annotated[int, Option(min=3, help="Of a spline.")] = 4,
+    knots: Annotated[int, Option(min=2, help="Of a spline, 3 or more.")] = 4,
     each: Annotated[bool, Option("--each", help="Fit every realization of a store too, for the pulls.")] = False,
     as_json: Annotated[bool, Option("--json", help="Print JSON.")] = False,
     output: Png = None,
