@@ -64,7 +64,8 @@ class TimeLine:
         """Return the score of a constant in each of so many equal parts of the survey's time, of one map, (parts,)."""
         line = self.visits[split] @ product
         starts = np.linspace(0, len(line), parts, endpoint=False).astype(int)
-        return np.asarray(np.add.reduceat(line, starts))
+        spans = np.diff(starts, append=len(line))  # a part of fewer than one has nothing, and not that of the next
+        return np.where(spans > 0, np.add.reduceat(line, starts), 0.0)
 
     def peak(self, on: str, products: Sequence[Map]) -> Choice:
         """Return the period of the largest peak between FEWEST cycles in the survey and the shortest period.

@@ -1,12 +1,14 @@
 """The periodogram of residuals along the scan, on scans and noise whose variances are known."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy import stats
 from scipy.sparse import csr_matrix
 
 from mcsim.reconstruction.periods import DRAWS, FEWEST, SPANS, TimeLine
-from mcsim.reconstruction.scores import PERIODIC, Scene
+from mcsim.reconstruction.scores import HISTORY, PERIODIC, Scene
 
 SPAN_S, COUNT, PIXELS, EACH = 300.0, 4000, 500, 5
 NOISE = 4.0  #: variance of the products of residuals
@@ -83,3 +85,13 @@ def test_no_period_is_looked_for_in_a_survey_of_an_hour(spans, looked_for):
     )
     assert len(scene.continua) - 1 == 2 * looked_for
     assert np.isfinite(np.log([tried for _, tried in scene.continua])).all()
+
+
+@pytest.mark.parametrize("spans", [1, 5, 16, 17, 500])
+def test_every_span_is_in_one_part_of_a_history(spans):
+    """A survey of fewer spans than parts has parts of which nothing is known."""
+    product = np.random.default_rng(5).normal(size=spans)
+    line = TimeLine((csr_matrix(np.eye(spans)),), SPAN_S, {})
+    starts = np.array([k * spans // HISTORY for k in range(HISTORY)] + [spans])
+    expected = [product[a:b].sum() for a, b in pairwise(starts)]
+    np.testing.assert_allclose(line.history(0, product, HISTORY), expected, rtol=1e-12, atol=1e-12)
