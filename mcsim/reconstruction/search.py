@@ -157,7 +157,7 @@ class Search:
             judged, falls, amplitudes = self.judged(members, rest, responses)
             order = np.argsort(-judged)
             best = int(order[0])
-            if found and falls[best] < SECOND * found[0].delta_chi2:
+            if judged[best] <= 0.0 or (found and falls[best] < SECOND * found[0].delta_chi2):
                 break
             less = {members[k]: judged[best] - judged[k] for k in map(int, order[1:])}
             near = [k for k, one in less.items() if one < np.log(ALTERNATIVES)]

@@ -1,6 +1,6 @@
 """The search of a grammar: what is found in scores, how significant it is, and what chance finds."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -164,6 +164,48 @@ def test_structures_are_judged_by_what_they_make_on_this_sky():
         assert (nothing, *none) == (0.0, 0.0)  # a response that is against the scores measures nothing
         _, average, _ = replace(search, exact=False).judged([0, 1], x, responses)
         np.testing.assert_allclose(average, expected, rtol=0.02)
+
+
+@dataclass
+class OnSky:
+    """What structures do on a sky: other than on average."""
+
+    search: Search
+    factors: dict[int, float]  #: of what the first makes of scores, by their places
+    rest: np.ndarray
+
+    def response(self, member, rest):
+        """Return a response with other factors."""
+        found = self.search.response(member, rest)
+        made = found.made.copy()
+        for place, factor in self.factors.items():
+            made[:, place] = factor * found.made[:, 0]
+        return found._replace(made=made)
+
+    def keep(self, member, amplitudes):
+        """Take what a structure makes from the scores."""
+        self.rest = self.rest - amplitudes @ self.response(member, self.rest).made
+
+    def left(self, chosen):
+        """Return the scores that are left."""
+        return self.rest
+
+
+def strong_gain():
+    """Return a search for two gains, and scores of the first at a signal-to-noise ratio of 10."""
+    chosen, simulations, mix = toy(400)
+    gain = replace(chosen[0], stage="gain", acts_on="sky and dipole", kind="constant")
+    search = Search((gain, chosen[5]), simulations)
+    covariance = mix @ mix.T
+    return search, 10.0 * covariance[0] / np.sqrt(covariance[0, 0]) + simulations.mean(axis=0)
+
+
+def test_what_this_sky_tells_against_is_not_there():
+    """However significant it is on average over skies: its error would be infinite."""
+    search, x = strong_gain()
+    search = replace(search, grammar=search.grammar[:1])
+    assert search.run(x, OnSky(search, {}, x))[0].structure == 0
+    assert search.run(x, OnSky(search, {0: -1.0}, x)) == []
 
 
 def test_monopoles_and_dipoles_that_a_modulation_makes_count():
