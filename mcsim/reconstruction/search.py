@@ -24,8 +24,9 @@ from mcsim.support.arrays import Matrix, Vector, divided
 LEVEL = 0.01  #: global p-value, all of the grammar charged, up to which a structure is there
 MOST = 3  #: largest number of structures
 
-SECOND = 0.1
-"""Least fall of chi^2 of a further structure over that of the first: below it may be the square of the first."""
+SECOND, AGAINST = 0.1, 4.0
+"""Least fall of chi^2 of a further structure over that of the first: below it may be the square of the first. And that
+of what is left over the largest of what was there: fits of two structures add up to twice the larger one at most."""
 
 FINALISTS, NEAR, SPARE = 20, 5.0, 2
 """Structures that are compared by their responses on the sky of the data: how many at most, within which difference of
@@ -141,30 +142,27 @@ class Search:
 
         ``sky`` knows what structures do on the sky of the data, whose patterns make scores correlated that are
         independent on average over skies. It judges between the finalists, and takes out what is found before the rest
-        is searched; None: by averages over skies. What a structure leaves for one that is like it is its
-        shape, and no further structure.
+        is searched; None: by averages over skies. What a structure leaves for one that is like it is its shape, and no
+        further structure. One that leaves more than AGAINST is refuted by other scores, and ends the search.
         """
         found: list[Found] = []
-        rest = scores
+        rest, most = scores, float(self._falls(scores).max())
         for _ in range(MOST):
             values = self.evidences(rest)
             values[[any(one.like(self.grammar[k.structure]) for k in found) for one in self.grammar]] = -np.inf
-            p = self.pvalue(float(values.max()))
-            if p > LEVEL:
+            if (p := self.pvalue(float(values.max()))) > LEVEL:
                 break
             members = self.finalists(values)
             responses = [(self if sky is None else sky).response(k, rest) for k in members]
             judged, falls, amplitudes = self.judged(members, rest, responses)
-            order = np.argsort(-judged)
-            best = int(order[0])
+            best, *others = map(int, np.argsort(-judged))
             if judged[best] <= 0.0 or (found and falls[best] < SECOND * found[0].delta_chi2):
                 break
-            less = {members[k]: judged[best] - judged[k] for k in map(int, order[1:])}
+            less = {members[k]: judged[best] - judged[k] for k in others}
             near = [k for k, one in less.items() if one < np.log(ALTERNATIVES)]
             own = self.grammar[members[best]]
-            rivals = (k for k in near if less[k] < np.log(RIVAL) and not own.like(self.grammar[k]))
-            if (rival := next(rivals, None)) is not None:  # is told first
-                near.insert(0, near.pop(near.index(rival)))
+            rival = next((k for k in near if less[k] < np.log(RIVAL) and not own.like(self.grammar[k])), None)
+            near.sort(key=lambda k: k != rival)  # it is told first
             found.append(Found(members[best], float(values.max()), p, float(falls[best]), tuple(near), rival))
             if (own.stage, own.kind) == ("added", "power"):  # nobody knows what such a pattern leaves in other scores
                 break
@@ -172,6 +170,8 @@ class Search:
             if sky is not None:
                 sky.keep(members[best], amplitudes[best])
             rest = rest - amplitudes[best] @ responses[best].made if sky is None else sky.left(chosen)
+            if self._falls(rest).max() > AGAINST * max(most, *(one.delta_chi2 for one in found)):
+                return found[:-1]
         return found
 
     def evidences(self, scores: Vector) -> Vector:

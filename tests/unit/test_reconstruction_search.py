@@ -208,6 +208,13 @@ def test_what_this_sky_tells_against_is_not_there():
     assert search.run(x, OnSky(search, {0: -1.0}, x)) == []
 
 
+@pytest.mark.parametrize(("made", "found"), [(1.0, [0, 1]), (30.0, [])])
+def test_a_structure_that_leaves_more_than_there_was_is_none(made, found):
+    """What it makes on this sky of scores that are not its own, the data have not."""
+    search, x = strong_gain()
+    assert [one.structure for one in search.run(x, OnSky(search, {5: made}, x))] == found
+
+
 def test_monopoles_and_dipoles_that_a_modulation_makes_count():
     """Scores of a pattern that multiplies the sky leave them out."""
     _, simulations, _ = toy(400)
