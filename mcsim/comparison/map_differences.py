@@ -30,6 +30,8 @@ BROUGHT = 0.5
 MORE_ALIKE = 0.2
 """By how much mirrored maps must correlate more with side B: maps of different skies do so by chance, or a little."""
 
+TOLD = 0.5  #: share of the pixels that are compared in which maps that may have been exchanged must have data
+
 
 class Calibration(Difference):
     """The maps of side B are those of side A times a factor."""
@@ -219,8 +221,10 @@ class SplitExchanged(Difference):
 
     def starts(self, state: State) -> list[Vector]:
         """Return all pairs of splits that both differ."""
-        differing = np.flatnonzero(state.pair.seen.any(axis=1))
-        return [np.array([float(i), float(j)]) for i in differing for j in differing if j < i]
+        seen, data = state.pair.seen, state.pair.a != healpy.UNSEEN
+        differing = np.flatnonzero(seen.any(axis=1)).tolist()
+        both = [[i, j] for i in differing for j in differing if j < i]
+        return [np.array(pair, dtype=np.float64) for pair in both if _tells(data[pair[::-1]], seen[pair])]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         return _complete(self.undone(maps, value), state)
@@ -230,6 +234,11 @@ class SplitExchanged(Difference):
         order = list(range(len(maps)))
         order[i], order[j] = order[j], order[i]
         return maps[order]
+
+
+def _tells(data: NDArray[np.bool_], seen: NDArray[np.bool_]) -> bool:
+    """Return True if exchanged maps have data in enough of the pixels that are compared."""
+    return int(np.sum(data & seen)) > TOLD * int(seen.sum())
 
 
 def _complete(exchanged: Maps, state: State) -> Maps:
@@ -249,7 +258,8 @@ class ChannelExchanged(Difference):
         alike = [(i, other) for i, other in enumerate(state.others) if other.a.shape == state.maps.shape]
         if all(_kept(other, state.pair) for _, other in alike):
             return []
-        return [np.array([float(i)]) for i, other in alike if _rms(other.b - other.a, other.seen) > state.floor]
+        differing = [(i, other) for i, other in alike if _rms(other.b - other.a, other.seen) > state.floor]
+        return [np.array([float(i)]) for i, other in differing if _tells(other.a != healpy.UNSEEN, state.pair.seen)]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         return _complete(state.others[int(value[0])].a, state)

@@ -9,7 +9,7 @@ import pytest
 import mcsim
 from mcsim.comparison import time_differences
 from mcsim.comparison.effects import EffectDifference
-from mcsim.comparison.map_differences import Calibration, Dipole, FrameReversed, Monopole, Unit
+from mcsim.comparison.map_differences import Calibration, ChannelExchanged, Dipole, FrameReversed, Monopole, Unit
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.prediction import Prediction, Set
 from mcsim.comparison.scene_differences import Smoothing, TimeShift
@@ -106,3 +106,17 @@ def test_what_a_grid_makes_is_the_same_whatever_side_b_has_observed(monkeypatch)
     for here in (seen, ~seen):
         pair = SimpleNamespace(scene=scene, pointing=lambda longest: "known", seen=here)
         np.testing.assert_array_equal(difference._response(np.array([2.0, 1.0]), pair)[here], 2.0)
+
+
+def test_maps_without_data_where_a_channel_is_compared_are_not_its_own():
+    """An exchange with a channel of another part of the sky left nothing, whatever the difference was."""
+    draw, north = np.random.default_rng(3), np.arange(12 * 8**2) < 6 * 8**2
+
+    def cut(name: str, seen: np.ndarray) -> ChannelPair:
+        a = np.where(seen, draw.standard_normal((1, seen.size)), healpy.UNSEEN)
+        return ChannelPair(name, (name,), a, np.where(seen, 1.2 * a, healpy.UNSEEN), seen[None])
+
+    one, other = cut("V", north), cut("W", ~north)
+    found = Problem(one, (other,), 0.0, library=[ChannelExchanged(), Calibration()]).best()
+    assert found[0].names == {"calibration"}
+    assert found[0].left == pytest.approx(0.0, abs=1e-12)
