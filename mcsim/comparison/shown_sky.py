@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import Maps, Scene
-from mcsim.comparison.sky_of_maps import NEAR, WHOLE, circular_response, sky_in, wiener
+from mcsim.comparison.sky_of_maps import WHOLE, averaged, circular_response, sky_in, wiener
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.support.arrays import Alm
@@ -170,18 +170,19 @@ def _sharper(pair: ChannelPair) -> ChannelPair:
 def _weight(pair: ChannelPair) -> Maps | None:
     """Return the inverse variance of the noise of every pixel, 1/uK^2, shape (split, npix); None without noise.
 
-    It is that of the difference of two splits, or of what the sky that it shows leaves of a single map, which has the
-    degrees of freedom that the sky's coefficients leave; shared out as 1 over samples or evenly, whichever is more
-    likely.
+    It is that of the difference of two splits, or of what the sky that it shows leaves of a single map, or of splits
+    without a common pixel, which have the degrees of freedom that the sky's coefficients leave; shared out as 1 over
+    samples or evenly, whichever is more likely.
     """
     if pair.scene is None or pair.hits is None or pair.scene.preparations:
         return None
     first = np.flatnonzero(pair.seen.any(axis=1))[:2]
-    whole = first.size > 1
+    whole = first.size > 1 and bool(pair.seen[first].all(axis=0).any())
+    first = first[: 1 + whole]
     seen = pair.seen[first].all(axis=0)
     rest = _missing(pair)[first][:, seen]
     mean = pair.a[first][:, seen].mean(axis=0)
-    freedom = 1.0 if whole else 1.0 - _coefficients(pair.scene, pair.nside) / max(int(seen.sum()), 1)
+    freedom = 1.0 if whole else 1.0 - _coefficients(pair.scene, pair.nside) / max(int(pair.seen.sum()), 1)
     if freedom < FREE:
         return None
     noise = (rest[0] - rest[1]) if whole else rest[0] / np.sqrt(freedom)
@@ -217,7 +218,7 @@ def _filtered(pair: ChannelPair, weight: Maps) -> ChannelPair:
     total = weight.sum(axis=0)
     noise = healpy.nside2pixarea(pair.nside) / np.mean(total[total > 0.0])
     shown = healpy.alm2cl(alm_.multiply(alm_.resize(scene.sky, scene.lmax, lmax), factor, lmax))
-    power = np.maximum(np.convolve(shown, np.ones(NEAR) / NEAR, "same") - noise, 1e-3 * noise) * known
+    power = np.maximum(averaged(shown) - noise, 1e-3 * noise) * known
 
     def sky_of(values: NDArray[np.float64]) -> Alm:
         smooth = wiener(values, total, power, scene.nthreads)

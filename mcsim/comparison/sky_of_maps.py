@@ -99,7 +99,7 @@ def _behind_holes(maps: Maps, seen: NDArray[np.bool_], empty: Scene, beside: Alm
         shown = healpix.analysis(mean_map(maps, seen), lmax, nthreads=nthreads)
     power = healpy.alm2cl(shown) / float(seen.any(axis=0).mean())
     variance = TRUSTED**2 * float((2 * np.arange(lmax + 1) + 1) @ power) / (4.0 * np.pi)
-    power = np.maximum(np.convolve(power, np.ones(NEAR) / NEAR, "same"), 1e-3 * variance * healpy.nside2pixarea(nside))
+    power = np.maximum(averaged(power), 1e-3 * variance * healpy.nside2pixarea(nside))
     weight, sky = seen.sum(axis=0) / variance, before
     for _ in range(FILTERS if beside is None else FILTERS_AGAIN):
         rest = np.where(seen, maps - replace(empty, sky=sky - before).maps(), 0.0).sum(axis=0) / variance
@@ -107,6 +107,11 @@ def _behind_holes(maps: Maps, seen: NDArray[np.bool_], empty: Scene, beside: Alm
         smooth = wiener(rest, weight, power * known, nthreads, smooth, ITERATIONS)
         sky = alm_.resize(alm_.multiply(smooth, inverse, lmax), lmax, empty.lmax)
     return sky - before
+
+
+def averaged(power: Vector) -> Vector:
+    """Return power averaged over the :data:`NEAR` nearest degrees, zero beyond its ends."""
+    return np.convolve(power, np.ones(NEAR) / NEAR)[NEAR // 2 :][: power.size]
 
 
 def wiener(

@@ -400,3 +400,19 @@ def test_splits_by_rings_are_refused():
     run = config.load(MODEL | {"map": MODEL["map"] | {"split_by": "rings"}})
     with refused("rings", '"time"', '"sets"'):
         mcsim.compare([np.zeros(3072)] * 2, [np.zeros(3072)] * 2, run)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_halves_that_have_no_pixel_in_common_are_not_exchanged(noise: float) -> None:
+    """An exchange of them explained all, as exchanged maps had no data; the noise of a difference had no pixel."""
+    simulator = Simulator()
+    east = healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[0] > 0.0
+    skies, drawn = simulator(), noise_of(simulator)
+
+    def cut(factor: float) -> Maps:
+        maps = [factor * m + noise * n for m, n in zip(skies, drawn, strict=True)]
+        return [np.where(east, maps[0], healpy.UNSEEN), np.where(east, healpy.UNSEEN, maps[1])]
+
+    found = mcsim.compare(cut(1.0), cut(1.01), simulator.run)
+    assert names(found) == ["calibration"]
+    assert found.channels[0].differences[0].amplitude == pytest.approx(0.01, rel=0.02)

@@ -6,7 +6,7 @@ import pytest
 
 import mcsim
 from mcsim.comparison.scene import Scene
-from mcsim.comparison.sky_of_maps import TRUSTED, sky_in
+from mcsim.comparison.sky_of_maps import TRUSTED, averaged, sky_in
 from mcsim.sphere import healpix
 
 NSIDE, LMAX = 16, 32
@@ -41,6 +41,21 @@ def test_a_sky_is_corrected_for_what_is_missing_beside_it(scene, seen):
     found = sky_in(0.1 * scene.maps(), seen, scene, beside=less)
     assert _left(scene, less + found, seen) < TRUSTED
     assert np.linalg.norm(less + found) < 1.05 * np.linalg.norm(scene.sky)
+
+
+@pytest.mark.parametrize("lmax", [2, 3])
+def test_skies_of_few_degrees_are_found_behind_holes(seen, lmax):
+    """Power is averaged over five degrees: of fewer there was no average of the same length."""
+    sky = (1.0 + np.arange(healpy.Alm.getsize(lmax))).astype(complex)
+    beam, window = mcsim.Beam.gaussian(500.0, lmax), healpix.pixel_window(NSIDE, lmax)
+    few = Scene(sky, beam, window, (mcsim.Moments.parallel_transport(NSIDE, 30.0, 2),))
+    assert _left(few, sky_in(few.maps(), seen, few), seen) < TRUSTED
+
+
+def test_power_is_averaged_over_the_nearest_degrees():
+    assert np.allclose(averaged(np.array([5.0, 10.0, 15.0, 20.0])), [6.0, 10.0, 10.0, 9.0])
+    power = np.random.default_rng(7).random(40)
+    assert np.allclose(averaged(power)[2:-2], [power[k : k + 5].mean() for k in range(36)])
 
 
 def _left(scene: Scene, sky: np.ndarray, seen: np.ndarray) -> float:
