@@ -217,12 +217,12 @@ class FilteredMaps:
 
 
 def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
-    """Prepare a survey for the filter; raise InputError unless it has a spectrum of the sky, and pixels.
+    """Prepare a survey for the filter; raise InputError unless it has power of the sky, and pixels.
 
     Of a channel that reads differences of two beams, the filter knows the mean of both sides.
     """
-    if survey.cl is None:
-        raise InputError("a diagnosis needs the spectrum of the sky; give sky.spectrum.")
+    if survey.cl is None or not survey.cl[2:].any():
+        raise InputError("a diagnosis needs the spectrum of the sky, with power from l = 2 on; give sky.spectrum.")
     run = survey.config
     if run.map.grid == "gl":
         raise InputError('a diagnosis compares maps of pixels; give the model map.grid = "healpix" and map.nside.')

@@ -140,3 +140,12 @@ def test_a_map_without_noise_needs_a_floor_of_it() -> None:
     with refused("noise_floor", 0, quiet.map_names[0]):
         model_of(quiet, DiagnosisSettings(noise_floor=0.0))
     model_of(survey(run), DiagnosisSettings(noise_floor=0.0))
+
+
+def test_a_sky_without_power_is_refused() -> None:
+    """No number of the sky is left to measure: that ended in a traceback."""
+    table = two_channels("empty")
+    power = np.where(np.arange(table["sky"]["lmax"] + 1) < 2, 1.0, 0.0)
+    shared = survey(config.load(table | {"sky": {**table["sky"], "spectrum": power}}))
+    with refused("sky.spectrum", "l = 2"):
+        model_of(shared, DiagnosisSettings())
