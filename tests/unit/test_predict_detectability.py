@@ -129,6 +129,11 @@ def test_user_errors():
         fisher_information(signal[None, None], [(2, 0, -1)], cl[None, None])
     with refused("L=0"):
         signal_to_noise(signal, [(0, 0, 0)], Spectra(cl))
+    for ells in ((3, 2), (-1, 4)):  # an empty slice: a signal to noise of zero
+        with refused("ell_range", *ells):
+            signal_to_noise(signal, [(2, 0, 0)], Spectra(cl), ell_range=ells)
+    with refused("cl_total", "finite"):  # left out as if without power
+        fisher_information(signal[None, None], [(2, 0, 0)], np.where(cl < 2, np.nan, cl)[None, None])
     with refused("(1, 4)", "(1, 5)"):
         signal_to_noise(signal[:, :4], [(2, 0, 0)], Spectra(cl))
     with refused("y", "ell = 2", "lmax", 4):

@@ -11,7 +11,7 @@ from scipy.special import eval_legendre
 from mcsim.bipolar.modes import Indices, check_modes, existing
 from mcsim.bipolar.theory.harmonics import map_harmonics, spin_functions
 from mcsim.errors import InputError
-from mcsim.sphere.checks import check_cl, check_shape
+from mcsim.sphere.checks import check_cl, check_finite, check_shape
 from mcsim.support.arrays import divided
 
 
@@ -142,6 +142,8 @@ def signal_to_noise(
     _check_f_sky(f_sky)
     _check_biposh(biposh, (len(modes), len(spectra.x)))
     first, last = (0, biposh.shape[1] - 1) if ell_range is None else ell_range
+    if not 0 <= first <= last:
+        raise InputError(f"ell_range = {first}, {last} is no range of degrees; give its first and its last one, >= 0.")
     if any(L == 0 for L, _, _ in modes):
         raise InputError("the signal of L=0 is that of C_l, not of an anisotropy; give modes with L >= 1.")
     variance = isotropic_variance(modes, spectra)[:, first : last + 1]
@@ -163,7 +165,8 @@ def fisher_information(
     ordered pair of maps per unit of the parameter, uK^2, shape (n_map, n_map, n_mode, lmax + 1); the modes (L, M, d)
     have M >= 0 and d >= 0: d < 0 belongs to the exchanged pair, L = 0 is the part of C_l. ``cl_total`` are the total
     spectra and cross-spectra of the maps, uK^2, shape (n_map, n_map, lmax + 1); degrees where this is singular (such as
-    l = 0, 1 without power) are left out. Raise InputError if f_sky is outside (0, 1], or a mode has M < 0 or d < 0.
+    l = 0, 1 without power) are left out. Raise InputError if f_sky is outside (0, 1], a mode has M < 0 or d < 0, or a
+    spectrum is not finite.
 
     Notes
     -----
@@ -178,6 +181,7 @@ def fisher_information(
             raise InputError(f"mode L={L}, M={M}, d={d} repeats information of M >= 0, d >= 0; leave it out.")
     n_map, lmax = len(cl_total), cl_total.shape[-1] - 1
     check_shape(cl_total, (n_map, n_map, lmax + 1), "cl_total")
+    check_finite(cl_total, "cl_total")
     spectra = np.moveaxis(cl_total, -1, 0)
     inverse = np.zeros_like(spectra)
     diagonal = np.einsum("lxx->lx", spectra)
