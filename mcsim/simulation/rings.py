@@ -32,6 +32,11 @@ _ROUND_OFF = 1e8  #: loss of digits that the division by sin^s(theta) on the rin
 
 _FEW = 3e8  #: points times squared nodes up to which a rule is built by Lanczos steps: about a second
 
+_MISSED = 1e-6
+"""Error of an integral over that of one from which on the recurrence point by point is not good enough."""
+
+_CHECKED = 64  #: cosines of multiples of the colatitude whose integrals tell that error
+
 
 @dataclass(frozen=True)
 class Rings:
@@ -65,10 +70,11 @@ def limit_rings(model: ScanModel, orders: Iterable[int], degree: int) -> tuple[R
     -----
     The integrals are first sums over the many nodes of a double-exponential rule between the caustics. Where w_s has
     one sign, the Gauss rule of the weight w_s says the same with degree/2 + 1 rings, from its three-term recurrence:
-    by Lanczos steps, or, where these are too many, point by point (Gragg & Harwood 1984, Numer. Math. 44, 317). Where
-    it changes sign, as it does about every caustic, each sign has rules of its own, over its intervals or altogether,
-    whichever takes fewer rings: 1251 for WMAP, s = 2 and degree 2048. Against brute-force spin transforms: better than
-    1e-5 of what the beam adds, 1e-11 for parallel transport (tests/unit/test_rings.py).
+    by Lanczos steps, or, where these are too many and its round-off stays below 1e-6, point by point (Gragg & Harwood
+    1984, Numer. Math. 44, 317). Where it changes sign, as it does about every caustic, each sign has rules of its own,
+    over its intervals or altogether, whichever takes fewer rings: 1251 for WMAP, s = 2 and degree 2048. Against
+    brute-force spin transforms: better than 1e-5 of what the beam adds, 1e-11 for parallel transport
+    (tests/unit/test_rings.py).
     """
     orders = tuple(orders)
     if len({line.boresight_angle_deg for line in model.select()}) > 1:
@@ -226,8 +232,17 @@ def _gauss(x: Vector, weight: Vector, count: int) -> tuple[Vector, Vector]:
         # The same steps as for its mirror image, so that round-off is the same as well.
         nodes, weights = _gauss(-x[::-1], weight[::-1], count)
         return np.pi - nodes, weights
-    few = x.size * count**2 < _FEW
-    diagonal, squared = (_lanczos if few else _recurrence)(x, weight, count)
+    if x.size * count**2 >= _FEW:
+        theta, (nodes, weights) = np.arccos(x), _rule(x, weight, *_recurrence(x, weight, count))
+        multiples = np.linspace(0.0, 2.0 * count - 1.0, _CHECKED).astype(int).tolist()
+        missed = [weight @ np.cos(k * theta) - weights @ np.cos(k * nodes) for k in multiples]
+        if np.abs(missed).max() < _MISSED * weight.sum():
+            return nodes, weights
+    return _rule(x, weight, *_lanczos(x, weight, count))
+
+
+def _rule(x: Vector, weight: Vector, diagonal: Vector, squared: Vector) -> tuple[Vector, Vector]:
+    """Return the Gauss nodes, as colatitudes, and weights of a three-term recurrence."""
     if np.array_equal(x, -x[::-1]) and np.array_equal(weight, weight[::-1]):
         diagonal[:] = 0.0
     nodes, vectors = eigh_tridiagonal(diagonal, np.sqrt(squared[1:]))
