@@ -71,10 +71,13 @@ class BayesClassifier:
     def _pairs(self) -> dict[tuple[int, int], float]:
         """Pairs of candidates that can be drawn together, and their probabilities."""
         identities, weights = self.sampler.effects_library.identities, self.sampler.weights
-        pairs = combinations(np.flatnonzero(weights).tolist(), 2)
-        found = {(i, j): float(weights[i] * weights[j]) for i, j in pairs if identities[i] != identities[j]}
-        total = sum(found.values())
-        return {pair: weight / total for pair, weight in found.items()}
+        own = [sum(weights[[one == other for other in identities]]) for one in identities]
+        # The second is drawn until it is another one than the first.
+        return {
+            (i, j): float(weights[i] * weights[j] * (1.0 / (1.0 - own[i]) + 1.0 / (1.0 - own[j])))
+            for i, j in combinations(np.flatnonzero(weights).tolist(), 2)
+            if identities[i] != identities[j]
+        }
 
     @cached_property
     def _normals(self) -> Vector:

@@ -158,12 +158,12 @@ def _power(axes: Axes, score: Score) -> None:
         axes.plot(power.grid, power.limit, color=GREY, label="limit, known covariance")
         axes.plot(power.grid, power.finite, color=GREY, linestyle="--", label="limit, covariance of the simulations")
         _binned(axes, power.strengths, power.by_maximum, "largest matched filter", BLUE, 16)
-        _binned(axes, power.strengths, power.by_gap, "global test", RED, 16)
+        _binned(axes, 1.01 * power.strengths, power.by_gap, "global test", RED, 16)
     else:
         ones = [record for record in score.records if record.kind == "one"]
-        s = [record.strength for record in ones]
+        s = np.array([record.strength for record in ones])
         _binned(axes, s, [record.maximum <= ALPHA for record in ones], "largest matched filter")
-        _binned(axes, s, [record.p_value <= ALPHA for record in ones], "global test", RED)
+        _binned(axes, 1.01 * s, [record.p_value <= ALPHA for record in ones], "global test", RED)
     axes.axhline(0.9, color=GREY, linewidth=0.6, linestyle=":")
     axes.set(xlabel="Expected S/N", ylabel="Fraction detected at 5 %", title="Single effects", ylim=SHARE)
 

@@ -285,6 +285,19 @@ def test_pairs_have_the_marginal_likelihood_of_brute_force():
             assert found.get(name, 0.0) == pytest.approx(expected, abs=0.03)
 
 
+def test_pairs_have_the_prior_that_they_are_drawn_with():
+    """The rarer a first effect, the more often is a second another one: of 3000 pairs 500 were to be of two widths."""
+    sampler = CaseSampler(Prior(), linear_model(toy((NAMES[0], NAMES[3], NAMES[4]))))
+    draw, count = np.random.default_rng(5), 3000
+    drawn = [tuple(sorted(one.candidate for one in sampler.members(draw, 2))) for _ in range(count)]
+    pairs = BayesClassifier(sampler)._pairs
+    assert sum(pairs.values()) == pytest.approx(1.0, abs=1e-12)
+    assert pairs[0, 1] == pytest.approx(1.0 / 6.0, abs=1e-12)
+    for pair, expected in pairs.items():
+        sigma = np.sqrt(expected * (1.0 - expected) / count)
+        assert drawn.count(pair) / count == pytest.approx(expected, abs=4.0 * sigma), pair
+
+
 # Without an effect
 
 
