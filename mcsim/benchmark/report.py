@@ -16,6 +16,7 @@ from mcsim import systematics
 from mcsim.benchmark.summary import ALPHA, FAR, NAMED, REDUCED, Confusion, Score, confusion
 from mcsim.stats.intervals import Metric, binomial_interval
 from mcsim.support import page
+from mcsim.support.folders import filling, write_whole
 
 DOTS_PER_INCH = 110
 BLUE, RED, GREY = "#1f5fa8", "#c44e22", "0.45"
@@ -24,7 +25,6 @@ SHARE = (-0.03, 1.03)
 
 def write(score: Score, folder: Path) -> None:
     """Write ``score.json``, ``report.html`` and ``score.png`` into a folder, which is made if it does not exist."""
-    folder.mkdir(parents=True, exist_ok=True)
     everything, in_library = confusion(score.records), confusion(score.in_library)
     bayes = confusion(score.in_library, bayes=True)
     content = {
@@ -38,9 +38,7 @@ def write(score: Score, folder: Path) -> None:
         "left_out": score.unlisted,
         "cases": score.records,
     }
-    (folder / "score.json").write_text(json.dumps([_plain(content)], indent=1, allow_nan=False) + "\n")
     picture = page.png(score_figure(score, everything, bayes), DOTS_PER_INCH)
-    (folder / "score.png").write_bytes(picture)
     text = page.render(
         Path(__file__).with_name("report.html.j2"),
         {"value": _value, "interval": _interval, "mark": _mark, "words": _words},
@@ -56,7 +54,10 @@ def write(score: Score, folder: Path) -> None:
         picture=page.embedded(picture),
         version=version("mcsim"),
     )
-    (folder / "report.html").write_text(text, encoding="utf-8")
+    with filling(folder):
+        write_whole(folder / "score.json", json.dumps([_plain(content)], indent=1, allow_nan=False) + "\n")
+        write_whole(folder / "score.png", picture)
+        write_whole(folder / "report.html", text)
 
 
 def lines(score: Score) -> list[str]:

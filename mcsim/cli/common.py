@@ -2,6 +2,7 @@
 
 import signal
 import sys
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
 from types import FrameType
@@ -11,7 +12,7 @@ from typer import Argument, Exit, Option
 from typer.core import TyperCommand, TyperGroup
 
 from mcsim.errors import InputError
-from mcsim.support.folders import outside_stores, unwritable, user_path
+from mcsim.support.folders import outside_stores, unwritable, user_path, write_whole
 from mcsim.support.loading import loaded
 
 
@@ -132,11 +133,11 @@ def picture(asked: Path | None, shown: str | Path, end: str = "") -> Path:
 
 def save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]
     """Save a figure and print its path; raise InputError if the file cannot be written, RunError on a full disk."""
+    buffer = BytesIO()
     try:
-        with unwritable(path, "choose another file with -o"):
-            figure.savefig(path)
+        figure.savefig(buffer, format=path.suffix[1:].lower())
     except ValueError as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{path} cannot be written ({error}); choose another file with -o.") from error
+    with unwritable(path, "choose another file with -o"):
+        write_whole(path, buffer.getvalue())
     print(f"wrote {path}")

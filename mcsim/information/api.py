@@ -25,13 +25,13 @@ from mcsim.simulation.channels import refuse_external
 from mcsim.simulation.filtering import unknown_dipole
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
 from mcsim.simulation.nuisance import nuisances_of
-from mcsim.support import folders
+from mcsim.support import folders, page
 from mcsim.support.arrays import divided
 from mcsim.support.numbers import duration
 from mcsim.support.progress import reporting
 from mcsim.support.settings import settings_of
 
-PICTURE = "limit.png"
+PICTURE, DOTS_PER_INCH = "limit.png", 100
 
 RESPONSE = 3.0  #: cost of a response over that of the circular maps of a sky, on average over the library
 
@@ -127,7 +127,8 @@ def limit(
     found = limits_of(candidates, information, tests, method, run.name, settings)
     if output is not None:
         found.save(output)
-        figure.limit_figure(found).savefig(output / PICTURE)
+        with folders.unwritable(output, "choose another folder"):
+            folders.write_whole(output / PICTURE, page.png(figure.limit_figure(found), DOTS_PER_INCH))
     return found
 
 

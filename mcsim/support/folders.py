@@ -126,9 +126,10 @@ def unreadable(name: str | Path, what: str, remedy: str) -> Iterator[None]:
         raise InputError(f"{name} cannot be read as {what} ({error}); {remedy}.") from error
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file that appears complete or not at all."""
-    with _written_beside(path, text) as scratch:
+    path = real_path(path)
+    with _written_beside(path, content) as scratch:
         os.replace(scratch, path)
 
 
@@ -139,12 +140,12 @@ def write_once(path: Path, text: str) -> None:
 
 
 @contextmanager
-def _written_beside(path: Path, text: str) -> Iterator[Path]:
-    """Yield a file with this text beside ``path``; delete it if it is still there at the end."""
+def _written_beside(path: Path, content: str | bytes) -> Iterator[Path]:
+    """Yield a file with this content beside ``path``; delete it if it is still there at the end."""
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch = path.with_name(f".{path.name}.{uuid4().hex}")
     try:
-        scratch.write_text(text, encoding="utf-8")
+        scratch.write_bytes(content.encode() if isinstance(content, str) else content)
         yield scratch
     finally:
         scratch.unlink(missing_ok=True)

@@ -117,9 +117,9 @@ def mcsim(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], t
     """
     savefig = Figure.savefig
 
-    def quick(figure: Figure, path: Path) -> None:
+    def quick(figure: Figure, target: Any, **options: Any) -> None:
         figure.set_layout_engine(None)
-        savefig(figure, path, dpi=50)
+        savefig(figure, target, **{**options, "dpi": 50})
 
     monkeypatch.setattr(Figure, "savefig", quick)
 

@@ -22,8 +22,10 @@ import zarr
 from astropy.io import fits
 from astropy.table import Table
 from distributed import Client, LocalCluster
+from matplotlib.figure import Figure
 
 from mcsim import cli, config, open_summary
+from mcsim.cli.common import save
 from mcsim.ensemble import describe, opening, runner, tables
 from mcsim.ensemble.maps import write_map
 from mcsim.ensemble.prediction import predict
@@ -133,6 +135,24 @@ def test_an_export_is_written_whole_or_not_at_all(name: str, small_store: Path, 
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert not list(tmp_path.iterdir())
     tables.write(whole, tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", ["x.png", "x.SVG", "x.pdf", "x.jpg"])
+def test_a_picture_stays_whole_where_the_next_does_not_fit(name: str, tmp_path: Path) -> None:
+    """It was cut off, or empty."""
+    figure = Figure()
+    figure.subplots()
+    save(figure, tmp_path / name)
+    first = (tmp_path / name).read_bytes()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
+    try:
+        with refused(name, errno=errno.EFBIG):
+            save(figure, tmp_path / name)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert (tmp_path / name).read_bytes() == first
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 

@@ -16,6 +16,8 @@ import xarray as xr
 from distributed import Client
 
 from mcsim import config
+from mcsim.benchmark import report as scores
+from mcsim.benchmark.summary import Score
 from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.kept import Kept
 from mcsim.diagnosis import report
@@ -75,6 +77,17 @@ def test_what_is_there_stays_whole_where_the_next_does_not_fit(disk: Path, monke
     xr.testing.assert_identical(xr.open_zarr(disk / "x.zarr", chunks=None), small)
     assert (disk / "report.html").read_text() == "first"
     assert sorted(path.name for path in disk.iterdir()) == ["report.html", "x.zarr"]
+
+
+def test_a_score_stays_whole_where_the_next_does_not_fit(disk: Path) -> None:
+    """Its report and picture were cut off, and "the output" was named."""
+    scores.write(Score("first", []), disk / "score")
+    before = {path.name: path.read_bytes() for path in (disk / "score").iterdir()}
+    size = os.statvfs(disk)
+    assert remount(disk, f"size={(size.f_blocks - size.f_bfree) * size.f_frsize}")
+    with refused(disk / "score", by=RunError, errno=errno.ENOSPC):
+        scores.write(Score("second", []), disk / "score")
+    assert {path.name: path.read_bytes() for path in (disk / "score").iterdir()} == before
 
 
 def test_full_disk(small_store: Path, client: Client, disk: Path) -> None:
