@@ -244,6 +244,8 @@ def _candidates(
     asked = {name: systematics.get(name, library) for name in (*settings.only, *settings.without)}
     library = {**library, **{kind.name: kind for kind in asked.values()}}
     only, without = ([asked[name].name for name in names] for names in (settings.only, settings.without))
+    if both := {*only} & {*without}:
+        raise InputError(f"{min(both)} is asked for and left out (--only and --without); choose one of them.")
     settings = replace(settings, only=tuple(only), without=tuple(without))
     named = dict.fromkeys((*settings.only, *(name.partition(":")[0] for name in settings.nuisances)))
     for name in named:
@@ -283,7 +285,7 @@ def _candidates(
             "nuisance, or this model lacks what it acts on, such as the times of a scan; ask for one of "
             f"{', '.join(sorted({candidate.name for candidate in analysis.candidates}))}."
         )
-    check_asked(analysis, [name for name in settings.only if name not in settings.without])
+    check_asked(analysis, settings.only)
     return analysis, numbered(wanted)
 
 

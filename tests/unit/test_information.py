@@ -459,6 +459,9 @@ def test_bad_input_is_refused() -> None:
         mcsim.limit(quiet)
     with refused("no_such"):
         mcsim.limit(model(), settings=mcsim.LimitSettings(only=("no_such",)))
+    with refused("beam_width", "--without"):  # of two effects, the other alone was computed
+        both = ("noise_level", "beam_width")
+        mcsim.limit(model(), settings=mcsim.LimitSettings(only=both, without=both[1:], dense=True))
     with refused("beam_width:X"):
         mcsim.limit(model(), settings=mcsim.LimitSettings(nuisances={"beam_width:X": 0.1}))
     with refused("beam_width", 0):
