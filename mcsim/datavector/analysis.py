@@ -23,6 +23,7 @@ from mcsim.simulation import differencing, sampled, simulate
 from mcsim.simulation.channels import refuse_unseen
 from mcsim.simulation.nuisance import DisturbedSurvey, Nuisance, check_nuisances, nuisances_of
 from mcsim.simulation.survey import Survey, survey
+from mcsim.simulation.timestream import CorrelatedNoise
 from mcsim.sphere import alm as alm_
 from mcsim.support.arrays import Alm, Map, Vector
 from mcsim.systematics import Effect, Library, acts_through
@@ -200,6 +201,9 @@ def _hindrance(model: Model, kind: type[Effect], channel: str | None, settings: 
         return "it acts on differencing, and the scan has none"
     if acts_through(kind, "excess") and any(owner.side_b is not None for owner in owners):
         return "it disturbs the samples of one beam, and the scan takes differences of two"
+    drawn = [m.drawn for owner in owners for m in owner.maps]
+    if acts_through(kind, "knee") and not all(isinstance(one, CorrelatedNoise) for one in drawn):
+        return "it moves the knee of noise with memory, and that of the maps has none"
     if acts_through(kind, "orientations"):
         scans = [spec.scan for spec in model.survey.config.channels if channel in (None, spec.name)]
         if not all(isinstance(scan, config.ScanParallelTransport) for scan in scans):

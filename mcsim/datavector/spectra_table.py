@@ -22,7 +22,7 @@ from mcsim.sphere.rotation import FRAMES, rotate_biposh
 from mcsim.support.arrays import Vector
 from mcsim.systematics import Library, acts_through
 
-_SPECTRAL_HOOKS = ("sky", "beam", "pointing", "spread", "orientations", "noise", "excess")
+_SPECTRAL_HOOKS = ("sky", "beam", "pointing", "spread", "orientations", "noise", "knee", "excess")
 """Hooks that change spectra of a map. Gains and signals of samples do so in the lowest degrees only, and are no
 candidates."""
 

@@ -8,7 +8,7 @@ from mcsim.reconstruction.scores import Scene
 from mcsim.reconstruction.structure import ALIKE, ANY, OFFSET, OPPOSITE, Structure
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import Library
-from mcsim.systematics.base import scan_direction
+from mcsim.systematics.spacecraft import scan_direction
 
 _DERIVATIVES = {1: "gradient", 2: "second derivative", 3: "third derivative", 4: "fourth derivative"}
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from mcsim import config, systematics
 from mcsim.config.messages import standing
-from mcsim.config.noise import is_noise_free
+from mcsim.config.noise import NoiseCorrelated, is_noise_free
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
 from mcsim.instrument.beams.coefficients import power_by_order
@@ -178,10 +178,15 @@ def check_effects(run: config.RunConfig) -> None:
 
 
 def _refuse_noise(run: config.RunConfig, spec: config.Channel, acting: tuple[systematics.Effect, ...]) -> None:
-    """Refuse effects on noise alone in a channel that has none."""
-    if not all(is_noise_free(spec.noise_of(split)) for split in run.map.each_split):
-        return
-    for effect in acting:
+    """Refuse effects on noise alone in a channel that has none, and on its memory where it is white."""
+    given = [spec.noise_of(split) for split in run.map.each_split]
+    for effect in acting if not any(isinstance(one, NoiseCorrelated) for one in given) else ():
+        if effect.amplitude != 0.0 and systematics.acts_through(effect, "knee"):
+            raise InputError(
+                f"effect {effect.name} on channel {spec.name} moves the knee of noise with memory, but the channel's "
+                'noise has none; remove it, or give the channel noise of kind "correlated".'
+            )
+    for effect in acting if all(is_noise_free(one) for one in given) else ():
         if effect.amplitude != 0.0 and effect.parametrization.noise_alone:
             raise InputError(
                 f"effect {effect.name} on channel {spec.name} acts on noise, but the channel has none; remove it, or "

@@ -32,12 +32,13 @@ from mcsim.simulation.pixel_means import Part, gain_of_all, signal_of_all
 from mcsim.simulation.preparation import Preparation, preparation
 from mcsim.simulation.rings import Rings, limit_rings, parallel_transport_rings
 from mcsim.simulation.survey_filter import filtering_of
+from mcsim.simulation.timestream import CorrelatedNoise
 from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.checks import check_whole
 from mcsim.sphere.mask import read_mask
 from mcsim.support.arrays import divided
 from mcsim.support.loading import once_per_content
-from mcsim.systematics import Effect, Library, Site, seen_through, spread_of, variance_factor
+from mcsim.systematics import Effect, Library, Site, acts_through, seen_through, spread_of, variance_factor
 
 
 @dataclass(frozen=True)
@@ -338,15 +339,17 @@ def _sigma0_uk(spec: config.Channel) -> float:
 
 def with_effects(m: SurveyMap, acting: tuple[Effect, ...], site: Site) -> SurveyMap:
     """Return the map with what effects make of its moments and noise."""
-    moments, noise, spread = m.moments, m.noise_uk, spread_of(acting)
+    moments, noise, drawn, spread = m.moments, m.noise_uk, m.drawn, spread_of(acting)
     for effect in acting:
         moments = effect.orientations(moments, site)
         factor = effect.noise(site)
         if factor is not None and noise is not None:
             noise = noise * np.sqrt(np.clip(factor, 0.0, None))
+        if isinstance(drawn, CorrelatedNoise) and effect.amplitude != 0.0 and acts_through(effect, "knee"):
+            drawn = drawn.with_knee(effect.knee(drawn.noise.f_knee_hz))
     if spread != 1.0:
         moments = moments.shrunk(spread)
-    return replace(m, moments=moments, noise_uk=noise)
+    return replace(m, moments=moments, noise_uk=noise, drawn=drawn)
 
 
 def _window(run: config.RunConfig, spec: config.Channel) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import ducc0
 import numpy as np
@@ -87,6 +88,20 @@ class CorrelatedNoise:
     def draw(self, seed: int, realization: int) -> Map:
         """Return the noise of a realization, uK, shape (npix,), 0 where nothing is observed; destriped, of mean 0."""
         return self._drawn(seed, realization, self.streams)
+
+    def with_knee(self, f_knee_hz: float) -> Self:
+        """Return the noise with another knee, of the same random numbers; at f_min or below it is white.
+
+        InputError if the sampling cannot show the knee.
+        """
+        nyquist = min(_nyquist_hz(self.model, line) for line in self.model.select())
+        if f_knee_hz >= nyquist:
+            raise InputError(
+                f"effects move the knee of the noise to {f_knee_hz:g} Hz, which is not below {nyquist:g} Hz, half the "
+                f"sampling rate of {self.model.name!r}; lower their amplitude or shorten scan.sample_period_s."
+            )
+        least = math.nextafter(self.noise.f_min_hz, math.inf)
+        return replace(self, noise=replace(self.noise, f_knee_hz=max(f_knee_hz, least)))
 
     def _drawn(self, seed: int, realization: int, streams: str) -> Map:
         in_pixels, in_baselines = np.zeros(self.grid.npix), np.zeros(0 if self.pairs is None else self.pairs.shape[0])
@@ -182,7 +197,7 @@ def _fill(folder: Path, empty: CorrelatedNoise) -> None:
 
 def _check(noise: NoiseCorrelated, model: ScanModel) -> None:
     for line in model.select():
-        nyquist = 0.5 / model.period_of_samples(line)
+        nyquist = _nyquist_hz(model, line)
         if noise.f_knee_hz >= nyquist:
             raise InputError(
                 f"noise.f_knee_hz = {noise.f_knee_hz:g} is not below {nyquist:g} Hz, half the sampling rate of "
@@ -194,6 +209,10 @@ def _check(noise: NoiseCorrelated, model: ScanModel) -> None:
                 f"noise.f_min_hz = {noise.f_min_hz:g} is below one over the duration of {model.name!r}, which cannot "
                 f"show it; give at least {shortest:.3g} Hz."
             )
+
+
+def _nyquist_hz(model: ScanModel, line: LineOfSight) -> float:
+    return 0.5 / model.period_of_samples(line)
 
 
 def _timed(

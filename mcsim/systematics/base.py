@@ -27,7 +27,6 @@ Map = NDArray[np.float64]
 Draw = Callable[[str], np.random.Generator]
 """From the name of a stage to its stream of random numbers in this realization."""
 
-_NAMED_WITHIN_DEG = 5.0  #: of a direction that has a name
 UNIFORM = 1e-9  #: relative departure of a beam from a multiple of another one that is round-off
 
 
@@ -228,6 +227,10 @@ class Effect:
         """Return the factor of the variance of every pixel's samples, shape (npix,); None: one."""
         return None
 
+    def knee(self, f_knee_hz: float) -> float:
+        """Return the true knee frequency of noise with memory from the fiducial one, Hz."""
+        return f_knee_hz
+
     def excess(self, count: Vector, rng: np.random.Generator) -> Vector:
         """Return the sums, uK, shape (n,), of what is added at random to each of ``count`` samples, shape (n,)."""
         return np.zeros_like(count)
@@ -410,6 +413,7 @@ def tried(acting: Sequence[Effect], site: Site) -> Beam:
     for effect in acting:
         effect.gain(once, site)
         effect.noise(site)
+        effect.knee(1.0)
         effect.differencing(0.0, 0)
     for effect in adding(acting):
         site.pointed(effect.name)
@@ -438,13 +442,3 @@ def streams(acting: Iterable[Effect]) -> Iterator[tuple[Effect, str]]:
     for effect in acting:
         number = met[effect.name] = met.get(effect.name, 0) + 1
         yield effect, f"effect/{effect.name}" if number == 1 else f"effect/{effect.name}/{number}"
-
-
-def scan_direction(angle_deg: float, period_deg: float = 360.0) -> str:
-    """Return a direction in the frame of the beam, x along the scan, in words; y is at +90°."""
-    angle = (angle_deg + period_deg / 2.0) % period_deg - period_deg / 2.0
-    side = f" ({'+' if angle > 0.0 else '−'}90°)" if period_deg > 180.0 else ""
-    for at, words in ((0.0, "along the scan"), (90.0, f"across the scan{side}"), (180.0, "against the scan")):
-        if abs(abs(angle) - at) < _NAMED_WITHIN_DEG:
-            return words
-    return f"at {angle:.0f}° to the scan".replace("-", "−")

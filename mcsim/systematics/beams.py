@@ -10,9 +10,10 @@ from scipy.optimize import minimize_scalar
 
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
-from mcsim.systematics.base import Bound, Effect, Site, Wording, scan_direction
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 from mcsim.systematics.parametrization import Angle, Parametrization, Vector, reciprocal
 from mcsim.systematics.shape import shape, stretched
+from mcsim.systematics.spacecraft import scan_direction
 
 
 @dataclass(frozen=True, kw_only=True)

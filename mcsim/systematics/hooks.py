@@ -11,7 +11,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments
 
 HOOKS = (
-    *("sky", "beam", "pointing", "gain", "signal", "noise", "excess"),
+    *("sky", "beam", "pointing", "gain", "signal", "noise", "knee", "excess"),
     *("spread", "orientations", "differencing", "moved", "lags"),
 )
 
@@ -22,6 +22,7 @@ _RETURNED = {
     "gain": "one real value for each of the times",
     "signal": "one real value for each of the times",
     "noise": "one real value for each pixel",
+    "knee": "a frequency",
     "excess": "one real value for each of the counts",
     "spread": "a number",
     "orientations": "mcsim.Moments",
@@ -84,7 +85,7 @@ def _shape(hook: str, values: np.ndarray, given: Sequence[Any]) -> tuple[int, ..
     match hook:
         case "noise":
             return (12 * given[0].nside ** 2,)
-        case "spread":
+        case "spread" | "knee":
             return ()
         case "differencing":
             return (2,)

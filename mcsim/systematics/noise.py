@@ -1,4 +1,4 @@
-"""Effects on the noise: its level, its pattern over the sky, and outliers among the samples."""
+"""Effects on the noise: its level, its pattern over the sky, its memory, and outliers among the samples."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,6 +80,33 @@ class NoiseAnisotropy(Effect):
                 f"{pattern.min():.3g} to {pattern.max():.3g}; choose a smaller one."
             )
         return np.asarray(factor)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseKnee(Effect):
+    """Knee frequency of noise with memory f_knee (1 + amplitude); white noise has none.
+
+    At the lowest frequency of the model, f_min, and below it the noise is white.
+    """
+
+    name = "noise_knee"
+    scope = "channel"
+    unit = "fraction of f_knee"
+    wording = Wording("{} higher knee", " %", 100.0, negative="{} lower knee")
+    cause = "Amplifiers, thermal control or an atmosphere that drift more than the noise model says."
+    signature = "Autos only, along the scan, most at the largest scales; destriped, nearly as noise_level."
+    source = "Planck 2013 results III, A&A 571, A3 (knee frequencies of LFI); Keihanen et al. 2004, A&A 428, 287"
+    step = 0.05
+    bounds = (Bound("amplitude", -1.0, 3.0, "a prior of this library: knees are known to a factor of four"),)
+    parametrization = Parametrization(noise_alone=True, matched_filter=False)
+
+    def knee(self, f_knee_hz: float) -> float:
+        if self.amplitude < -1.0:
+            raise InputError(
+                f"effect {self.name}: amplitude = {self.amplitude:g} makes a knee frequency negative; keep it at -1 or "
+                "above."
+            )
+        return (1.0 + self.amplitude) * f_knee_hz
 
 
 def _of_file(path: str, frame: str, centres: NDArray[np.float64]) -> Map:

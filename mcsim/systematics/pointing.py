@@ -7,10 +7,10 @@ import numpy as np
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import MapGrid, Moments, ScanModel, cached_moments
-from mcsim.systematics.base import Bound, Effect, Site, Wording, scan_direction
+from mcsim.systematics.base import Bound, Effect, Site, Wording
 from mcsim.systematics.parametrization import Angle, Parametrization, Vector
 from mcsim.systematics.shape import displaced, smeared
-from mcsim.systematics.spacecraft import axes
+from mcsim.systematics.spacecraft import axes, scan_direction
 
 FARTHEST_ARCMIN = 10800.0  #: to the opposite direction
 

@@ -37,6 +37,7 @@ SIGNATURES = {
     "transmission_imbalance": Signature("ecliptic"),
     "noise_anisotropy": Signature("ecliptic", (0, 2), "even"),
     "noise_level": Signature("", (0,), "even"),
+    "noise_knee": Signature("ecliptic", (0, 2), "even"),
     "foreground_residual": Signature("galactic"),
     "point_sources": Signature("", (0,), "even"),
     "dipole_modulation": Signature("", (1,), "even"),

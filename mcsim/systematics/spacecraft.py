@@ -1,4 +1,4 @@
-"""Where the spacecraft looks and moves: angles and directions that signals of its own depend on."""
+"""Where the spacecraft looks and moves: angles and directions that its signals depend on, and their words."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,6 +7,8 @@ from mcsim.instrument.scan import ScanModel
 from mcsim.sphere.rotation import rotation_matrix
 from mcsim.systematics.base import Pointing
 from mcsim.systematics.parametrization import Vector
+
+_NAMED_WITHIN_DEG = 5.0  #: of a direction that has a name
 
 
 def spin_phase(pointing: Pointing, time_s: Vector) -> Vector:
@@ -78,3 +80,13 @@ def axes(theta: Vector, phi: Vector) -> tuple[NDArray[np.float64], NDArray[np.fl
     sin_t, cos_t, sin_p, cos_p = np.sin(theta), np.cos(theta), np.sin(phi), np.cos(phi)
     outward = np.stack([sin_t * cos_p, sin_t * sin_p, cos_t])
     return outward, np.stack([cos_t * cos_p, cos_t * sin_p, -sin_t]), np.stack([-sin_p, cos_p, np.zeros_like(phi)])
+
+
+def scan_direction(angle_deg: float, period_deg: float = 360.0) -> str:
+    """Return a direction in the frame of the beam, x along the scan, in words; y is at +90°."""
+    angle = (angle_deg + period_deg / 2.0) % period_deg - period_deg / 2.0
+    side = f" ({'+' if angle > 0.0 else '−'}90°)" if period_deg > 180.0 else ""
+    for at, words in ((0.0, "along the scan"), (90.0, f"across the scan{side}"), (180.0, "against the scan")):
+        if abs(abs(angle) - at) < _NAMED_WITHIN_DEG:
+            return words
+    return f"at {angle:.0f}° to the scan".replace("-", "−")

@@ -11,7 +11,7 @@ from mcsim.config.noise import NoiseCorrelated
 from mcsim.ensemble import plan
 from mcsim.instrument.scan import MapGrid, ScanModel
 from mcsim.simulation import sampled, simulate, timestream, tod
-from mcsim.simulation.channels import scan_model
+from mcsim.simulation.channels import check_effects, scan_model
 from mcsim.simulation.survey import survey
 from refusals import refused
 
@@ -184,6 +184,46 @@ def test_samples_have_the_noise_of_the_default_route():
     run = run_with()
     noisy, quiet = (sampled.maps(survey(each), 0, epsilon=1e-3)[0][1] for each in (run, run_with({"sigma0_uk": 0.0})))
     assert noisy - quiet == pytest.approx(survey(run).channels[0].maps[0].noise(3, 0), abs=1e-9)
+
+
+@pytest.mark.parametrize("noise", [NOISE, DESTRIPED], ids=["binned", "destriped"])
+def test_another_knee_is_that_of_a_model_that_has_it(noise):
+    """Of the same random numbers, bit for bit, in both routes; at no knee the noise is white."""
+    effect = [{"name": "noise_knee", "channel": "W", "amplitude": 0.5}]
+    moved, own = survey(run_with(noise, effect=effect)), survey(run_with(noise | {"f_knee_hz": 7.5e-4}))
+    a, b = (each.making.channels[0].maps[0] for each in (moved, own))
+    assert np.array_equal(a.drawn.draw(3, 0), b.drawn.draw(3, 0))
+    assert not np.allclose(a.noise(3, 0), survey(run_with(noise)).channels[0].maps[0].noise(3, 0), atol=1e-3)
+    quiet = survey(run_with({"sigma0_uk": 0.0}))
+    by_default = simulate.maps(moved, 0)[0] - simulate.maps(quiet, 0)[0]
+    by_samples = sampled.maps(moved, 0)[0][1] - sampled.maps(quiet, 0)[0][1]
+    for found in (by_default, by_samples):
+        assert found == pytest.approx(a.noise(3, 0), abs=1e-9)
+
+
+def test_noise_with_a_knee_at_its_lowest_frequency_is_white():
+    made = short(NOISE)[0].with_knee(0.0)
+    fresh, number = np.random.default_rng(4), int(np.ceil(1.0 / PERIOD_S / made.noise.f_min_hz))
+    found = timestream.noise_samples(made.noise, 1.0 / PERIOD_S, np.random.default_rng(4))(100)
+    assert found == pytest.approx(2.0 * fresh.standard_normal(number + 100)[number:], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("noise", "amplitude", "named"),
+    [
+        ({"sigma0_uk": 2.0}, 0.5, ("noise_knee", "correlated")),
+        ({"sigma0_uk": 0.0}, 0.5, ("noise_knee", "correlated")),
+        (NOISE, -1.5, ("noise_knee", -1.5)),
+    ],
+)
+def test_a_knee_that_no_noise_has_is_refused(noise, amplitude, named):
+    with refused(*named):
+        check_effects(run_with(noise, effect=[{"name": "noise_knee", "channel": "W", "amplitude": amplitude}]))
+
+
+def test_a_knee_beyond_what_the_sampling_shows_is_refused():
+    with refused(1.5e-3, 0.5 / PERIOD_S, "scan.sample_period_s"):
+        survey(run_with(effect=[{"name": "noise_knee", "channel": "W", "amplitude": 2.0}]))
 
 
 def test_a_survey_that_spins_backwards_has_noise():
