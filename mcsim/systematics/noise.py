@@ -23,7 +23,7 @@ class NoiseLevel(Effect):
     scope = "channel"
     unit = "fraction of sigma0"
     wording = Wording("{} more noise", " %", 100.0, negative="{} less noise")
-    cause = "Noise estimated on other data, or a gain that is not the fiducial one."
+    cause = "Noise estimated on other data, a gain that is not the fiducial one, or drifts (1/f) that the model lacks."
     signature = "Autos only, flat in l, as the hits."
     source = "Jarosik et al. 2011, ApJS 192, 14 (sigma0 per channel, and its error)"
     step = 0.01
