@@ -185,7 +185,7 @@ def save(path: Path, ensemble: NullEnsemble, bank: TemplateBank) -> None:
 
 def load(path: Path) -> tuple[NullEnsemble, TemplateBank]:
     """Read what :func:`save` wrote."""
-    with xr.open_zarr(path, chunks=None, consolidated=False) as dataset:
+    with xr.open_zarr(path, chunks=None) as dataset:
         arrays = {str(name): np.asarray(values) for name, values in dataset.data_vars.items()}
         elements, beside = (
             TypeAdapter(tuple[Element, ...]).validate_json(dataset.attrs[key]) for key in ("elements", "slice_elements")

@@ -13,6 +13,8 @@ from uuid import uuid4
 
 from mcsim.errors import InputError, RunError
 
+CONTENT = ".content.json"  #: file of a cached folder with the names of all others, and their sizes in bytes
+
 
 def user_path(given: Any) -> Path:
     """Return a path that a user gives, with ~ for the home; InputError for what is no path."""
@@ -177,13 +179,14 @@ def default_cache_dir() -> Path:
 
 
 def cached(name: str, fill: Callable[[Path], None], cache_dir: str | Path | None = None) -> Path:
-    """Return a folder of the cache (default: :func:`default_cache_dir`); if it does not exist, ``fill`` an empty one.
+    """Return a folder of the cache (default: :func:`default_cache_dir`); if it is not whole, ``fill`` an empty one.
 
-    The name of the folder identifies everything that its content depends on.
+    The name of the folder identifies everything that its content depends on. Some clusters delete files of a scratch
+    disk one by one as they grow old, and a computer that stops leaves empty ones: such a folder is made again.
     """
     root = default_cache_dir() if cache_dir is None else Path(cache_dir)
     folder = root / name
-    if not folder.is_dir():
+    if not _is_whole(folder):
         try:
             not_a_file(folder)
         except InputError as error:
@@ -194,6 +197,10 @@ def cached(name: str, fill: Callable[[Path], None], cache_dir: str | Path | None
         try:
             with appearing(folder) as scratch:
                 fill(scratch)
+                (scratch / CONTENT).write_text(json.dumps(_sizes(scratch)))
+                if (place := real_path(folder)).is_dir() and not _is_whole(place):
+                    with suppress(FileNotFoundError):  # another process removes it, too
+                        shutil.rmtree(place)
         except OSError as error:
             if error.errno is None:  # from a connection or a timeout, not from a file
                 raise
@@ -202,3 +209,17 @@ def cached(name: str, fill: Callable[[Path], None], cache_dir: str | Path | None
                 "to one that can."
             ) from None
     return folder
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    """Return the sizes of all files in a folder, in bytes, by their paths in it."""
+    return {str(path.relative_to(folder)): path.stat().st_size for path in folder.rglob("*") if path.is_file()}
+
+
+def _is_whole(folder: Path) -> bool:
+    """Return True if a folder of the cache has all the files that it was made with, in their sizes."""
+    try:
+        made = json.loads((folder / CONTENT).read_bytes())
+        return all((folder / name).stat().st_size == size for name, size in made.items())
+    except (OSError, ValueError):
+        return False

@@ -79,6 +79,29 @@ def test_a_lost_connection_is_not_blamed_on_the_cache(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("lost", [[".content.json"], ["a"], ["b/c"], ["a", "b/c", ".content.json"]])
+@pytest.mark.parametrize("how", [lambda path: path.write_bytes(b""), lambda path: path.unlink()])
+def test_a_cached_folder_that_has_lost_files_is_filled_again(tmp_path, lost, how):
+    """Scratch disks delete old files and keep their folders: a learned model without one gave another verdict."""
+    filled = []
+
+    def fill(folder):
+        filled.append(folder)
+        (folder / "a").write_bytes(b"1234")
+        (folder / "b").mkdir()
+        (folder / "b" / "c").write_bytes(b"5")
+
+    folder = cached("x/name", fill, tmp_path)
+    assert cached("x/name", fill, tmp_path) == folder
+    assert len(filled) == 1
+    for name in lost:
+        how(folder / name)
+    assert cached("x/name", fill, tmp_path) == folder
+    assert ((folder / "a").read_bytes(), (folder / "b" / "c").read_bytes()) == (b"1234", b"5")
+    assert len(filled) == 2
+    assert [path.name for path in (tmp_path / "x").iterdir()] == ["name"]
+
+
 def test_home_is_found_in_what_users_give(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     assert user_path("~/a b") == tmp_path / "a b"

@@ -151,6 +151,9 @@ def test_save_and_load(tmp_path, mmap):
     assert isinstance(loaded.w.base, np.memmap) is mmap
     for name in ("hits", "w", "dtheta", "dphi"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(moments, name))
+    (tmp_path / "m" / "w.npy").write_bytes(b"")
+    with refused(tmp_path / "m"):
+        Moments.load(tmp_path / "m", mmap=mmap)
     (tmp_path / "m" / "w.npy").unlink()
     with refused("w.npy"):
         Moments.load(tmp_path / "m")

@@ -408,7 +408,7 @@ class Moments:
             # As plain arrays: those of numpy's own class for mapped files are slow to slice.
             arrays = {name: np.asarray(np.load(folder / f"{name}.npy", mmap_mode=mode)) for name in names}
             return cls(nside=meta["nside"], frame=meta["frame"], **arrays)
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, EOFError, ValueError, KeyError) as error:
             raise InputError(
                 f"folder {str(folder)!r} does not hold complete moments ({error}); delete it and compute them again."
             ) from None
