@@ -41,7 +41,8 @@ class Kept:
         for path in self._stream(job).glob("*-*.npy"):
             first, stop = map(int, path.stem.split("-"))
             if first < job.first + job.count and stop > job.first:
-                with suppress(FileNotFoundError):  # another process has learned the model and removed it
+                # Another process has learned the model and removed it; or it was cut off as the computer stopped.
+                with suppress(OSError, EOFError, ValueError):
                     rows.update(zip(range(first, stop), np.load(path), strict=True))
         return rows
 

@@ -156,5 +156,21 @@ def test_pieces_are_of_realizations_that_are_missing_and_of_the_same_simulations
         assert sum(count for _, count in missing(changed)) == 9
 
 
+@pytest.mark.parametrize("content", [b"", b"no array of numpy", None])
+def test_a_piece_that_cannot_be_read_is_simulated_again(tmp_path, content):
+    """A computer that stops leaves empty files; the next diagnosis ended in a traceback."""
+    run = config.load(MODEL)
+    job = replace(api.analysis_of(run, library=LIBRARY).job(run), first=0, count=4)
+    kept = Kept(tmp_path, 2)
+    for piece in kept.missing(job, {}):
+        kept.keep(piece, np.ones((2, 3)))
+    (path,) = tmp_path.glob("*/2-4.npy")
+    path.write_bytes(path.read_bytes()[:-1] if content is None else content)
+    (again,) = kept.missing(job, kept.found(job))
+    assert (again.first, again.count) == (2, 2)
+    kept.keep(again, np.ones((2, 3)))
+    assert list(kept.missing(job, kept.found(job))) == []
+
+
 def test_what_takes_long_is_kept_in_small_pieces(tmp_path):
     assert [Kept.of(tmp_path, nside, 10).size for nside in (16, 128, 256, 512)] == [10, 10, 2, 2]
