@@ -15,6 +15,7 @@ from pathlib import Path
 
 from mcsim.ensemble.store import refuse_unwritable
 from mcsim.errors import InputError, RunError
+from mcsim.support.processes import alive
 
 
 @contextmanager
@@ -84,7 +85,7 @@ def _remove_if_dead(lock: Path, path: Path) -> None:
         host, _, number = stream.read().partition(" ")
         process = int(number) if number.isdecimal() else 0
         own = process == os.getpid()
-        if host == socket.gethostname() and process and (own or not _alive(process)):
+        if host == socket.gethostname() and process and (own or not alive(process)):
             with suppress(BlockingIOError):  # another run of this process holds it
                 fcntl.flock(stream, fcntl.LOCK_EX | (fcntl.LOCK_NB if own else 0))
                 # If several processes find a dead lock, one removes it, and none removes a newer lock.
@@ -93,15 +94,3 @@ def _remove_if_dead(lock: Path, path: Path) -> None:
                 return
         who = f"process {process} on {host}" if process else "process 0 on an unknown host"
         raise InputError(f"Another run writes to {path} ({who}); wait for it, or remove {lock} if it is gone.")
-
-
-def _alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    with suppress(OSError):  # a zombie: ended, but not yet waited for by its parent
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    return True

@@ -4,14 +4,17 @@ import errno
 import json
 import os
 import shutil
+import socket
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from glob import escape
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 from mcsim.errors import InputError, RunError
+from mcsim.support.processes import alive
 
 CONTENT = ".content.json"  #: file of a cached folder with the names of all others, and their sizes in bytes
 
@@ -37,12 +40,18 @@ def real_path(path: Path) -> Path:
 def appearing(path: Path) -> Iterator[Path]:
     """Yield a scratch folder beside ``path``; rename it to ``path`` at the end, delete it if the block fails.
 
-    If another process was faster, its folder stays. InputError for a file in the place of a folder.
+    If another process was faster, its folder stays. What killed processes of this host have left there is deleted.
+    InputError for a file in the place of a folder.
     """
     path = real_path(path)
     not_a_file(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    host = f".{socket.gethostname()}."
+    for left in path.parent.glob(f".*{escape(host)}*.*"):
+        number = left.name.rpartition(host)[2].partition(".")[0]
+        if number.isdecimal() and not alive(int(number)):
+            shutil.rmtree(left, ignore_errors=True)
+    scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}{host}{os.getpid()}.", dir=path.parent))
     try:
         yield scratch
         scratch.chmod(0o755)  # a temporary folder is readable by its owner alone

@@ -2,6 +2,10 @@
 
 import errno
 import os
+import signal
+import socket
+import subprocess
+import sys
 
 import pytest
 
@@ -36,6 +40,26 @@ def test_who_was_quicker_stays(tmp_path):
             (other / "file").write_text("first")
     assert (tmp_path / "folder" / "file").read_text() == "first"
     assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
+
+
+def test_what_a_killed_process_has_left_is_deleted(tmp_path):
+    """Each killed diagnosis left a folder, pairs of a differencing scan 8 bytes for each sample."""
+    code = f"""
+import os, signal
+from pathlib import Path
+from mcsim.support.folders import appearing
+with appearing(Path({str(tmp_path / "one")!r})) as scratch:
+    (scratch / "file").write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    other = left.with_name(left.name.replace(socket.gethostname(), "elsewhere"))  # where it may be alive
+    other.mkdir()
+    with appearing(tmp_path / "two") as scratch, appearing(tmp_path / "three"):
+        assert {*tmp_path.iterdir()} >= {scratch, other}
+        assert not left.exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted((other.name, "three", "two"))
 
 
 def test_what_is_made_behind_a_link_is_there(tmp_path):
