@@ -169,23 +169,27 @@ def diagnose_controls(known: DiagnosisContext, key: str, count: int, call: Batch
     code = package_digest(["mcsim.diagnosis"])
     text = json.dumps([key, config.science(drawn.run), drawn.sample_by_sample, code], sort_keys=True)
     folder = folders.default_cache_dir().absolute() / "controls" / hashlib.sha256(text.encode()).hexdigest()[:32]
-    missing = [number for number in range(count) if not _verdict(folder, number).is_file()]
+    verdicts = {number: one for number in range(count) if (one := _read(folder, number)) is not None}
+    missing = [number for number in range(count) if number not in verdicts]
     absent = [number for number in missing if not _maps(folder, number).is_dir()]
     fixed = config.to_json(drawn.run), config.digest(drawn.run), known.analysis.library, drawn.sample_by_sample
     done = count - len(missing)
     with reporting("controls", float(count), "controls", quiet) as report, asking(call, quiet=True) as ask:
 
         def finish(number: int) -> None:
-            """Diagnose a control that is drawn; its maps are not needed again."""
+            """Diagnose a control that is drawn, unless another process has; its maps are not needed again."""
             nonlocal done
             path = _maps(folder, number) / "maps.npy"
-            if not path.is_file():
-                raise RunError(f"A worker drew {path}, and it is not there; let all workers share one cache.")
-            maps = read_npy(path, "f", (2,))
-            found = diagnose_data(ObservedMaps(known, list(maps), ask), f"control {number}")
-            control = Control(found.test.pvalue, found.kind, tuple(effect.label for effect in found.effects))
-            folders.write_whole(_verdict(folder, number), json.dumps(asdict(control)) + "\n")
-            shutil.rmtree(path.parent)
+            present, control = path.is_file(), _read(folder, number)
+            if control is None:
+                if not present:
+                    raise RunError(f"A worker drew {path}, and it is not there; let all workers share one cache.")
+                maps = read_npy(path, "f", (2,))
+                found = diagnose_data(ObservedMaps(known, list(maps), ask), f"control {number}")
+                control = Control(found.test.pvalue, found.kind, tuple(effect.label for effect in found.effects))
+                folders.write_whole(_verdict(folder, number), json.dumps(asdict(control)) + "\n")
+            verdicts[number] = control
+            shutil.rmtree(path.parent, ignore_errors=True)
             done += 1
             report(float(done))
 
@@ -195,8 +199,7 @@ def diagnose_controls(known: DiagnosisContext, key: str, count: int, call: Batch
                 finish(number)
         for index, _ in call(draw, ((*fixed, number, str(_maps(folder, number))) for number in absent)):
             finish(absent[index])
-    plain = [json.loads(_verdict(folder, number).read_text()) for number in range(count)]
-    members = tuple(Control(**one | {"effects": tuple(one["effects"])}) for one in plain)
+    members = tuple(verdicts[number] for number in range(count))
     return Controls(members, drawn.words, known.settings.alpha)
 
 
@@ -206,6 +209,15 @@ def _maps(folder: Path, number: int) -> Path:
 
 def _verdict(folder: Path, number: int) -> Path:
     return folder / f"{number:05d}.json"
+
+
+def _read(folder: Path, number: int) -> Control | None:
+    """Return the verdict on a control; None if there is none, or a computer stopped as it was written."""
+    try:
+        plain = json.loads(_verdict(folder, number).read_text())
+    except (FileNotFoundError, ValueError):
+        return None
+    return Control(**plain | {"effects": tuple(plain["effects"])})
 
 
 def describe(analysis: Analysis, count: int, workers: int) -> list[str]:

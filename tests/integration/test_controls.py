@@ -17,6 +17,7 @@ from mcsim.diagnosis.control_result import Control, Controls
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
+from mcsim.support.folders import default_cache_dir
 from pictures import quick_pictures
 from refusals import refused
 
@@ -120,6 +121,24 @@ def test_controls_are_drawn_once_and_go_on_after_a_kill(sound, client, monkeypat
     assert more.members[:COUNT] == found.controls.members
     monkeypatch.setattr(controls, "draw", draw)
     assert diagnosed(model(50), None, COUNT + 2, workers=client).controls.members[:-1] == more.members
+
+
+def test_two_diagnoses_at_once_share_their_controls(sound, monkeypatch):
+    """The slower one said that workers do not share a cache; an empty verdict, of a computer that stopped, ended it."""
+    found, _ = sound
+    draw, quicker = controls.draw, []
+
+    def drawn_by_both(*all_):
+        monkeypatch.setattr(controls, "draw", draw)
+        quicker.append(diagnosed(model(50), None, COUNT + 4).controls)
+        draw(*all_)
+
+    monkeypatch.setattr(controls, "draw", drawn_by_both)
+    assert diagnosed(model(50), None, COUNT + 4).controls == quicker[0]
+    (folder,) = {path.parent for path in default_cache_dir().glob(f"controls/*/{COUNT + 3:05d}.json")}
+    assert all(path.is_file() for path in folder.iterdir())  # no maps are left
+    (folder / "00001.json").write_bytes(b"")
+    assert diagnosed(model(50), None, COUNT).controls.members == found.controls.members
 
 
 def test_finer_pixels_keep_the_noise_of_coarse_ones():
