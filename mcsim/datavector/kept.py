@@ -57,11 +57,14 @@ class Kept:
             wanted = wanted[count:]
 
     def keep(self, piece: Job, rows: Matrix) -> None:
-        """Write the rows of a piece to a file that appears complete or not at all."""
+        """Write the rows of a piece to a file that appears complete or not at all.
+
+        It is not kept if another process, which has learned the model, removes the folder right then.
+        """
         folder = self._stream(piece)
         with folders.unwritable(folder, "make room there, or set MCSIM_CACHE to another folder"):
             folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            with suppress(FileNotFoundError), tempfile.TemporaryDirectory(dir=folder) as scratch:
                 write_npy(whole := Path(scratch) / f"{piece.first}-{piece.first + piece.count}.npy", rows)
                 os.replace(whole, folder / whole.name)
 

@@ -1,5 +1,6 @@
 """A diagnosis that is killed while it learns a model goes on where it stopped."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from mcsim.datavector.kept import Kept
 from mcsim.diagnosis import api, words
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
+from mcsim.support.npy import write_npy
 
 MODEL = {
     "schema": 1,
@@ -170,6 +172,27 @@ def test_a_piece_that_cannot_be_read_is_simulated_again(tmp_path, content):
     assert (again.first, again.count) == (2, 2)
     kept.keep(again, np.ones((2, 3)))
     assert list(kept.missing(job, kept.found(job))) == []
+
+
+@pytest.mark.parametrize("written", [True, False])
+def test_who_learns_a_model_ends_no_other_diagnosis_of_it(tmp_path, monkeypatch, written):
+    """The first to learn it removes what is kept; the other said that the cache cannot be written."""
+    run = config.load(MODEL)
+    job = replace(api.analysis_of(run, library=LIBRARY).job(run), first=0, count=2)
+    parts = Kept(tmp_path / "parts", 2)
+
+    def write(path, rows):
+        if written:
+            write_npy(path, rows)
+        shutil.rmtree(tmp_path / "parts")
+        if not written:
+            write_npy(path, rows)
+
+    monkeypatch.setattr("mcsim.datavector.kept.write_npy", write)
+    parts.keep(job, np.ones((2, 3)))
+    monkeypatch.undo()
+    parts.keep(job, np.ones((2, 3)))
+    assert len(parts.found(job)) == 2
 
 
 def test_what_takes_long_is_kept_in_small_pieces(tmp_path):
