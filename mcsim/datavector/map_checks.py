@@ -8,8 +8,9 @@ from pathlib import Path
 import healpy
 import numpy as np
 
+from mcsim import config
 from mcsim.datavector.wiener_filter import Model, Part, sky_variance
-from mcsim.ensemble.external_maps import in_uk
+from mcsim.ensemble.external_maps import in_uk, parts_of
 from mcsim.ensemble.maps import POINTING, file_names, first_realization
 from mcsim.errors import InputError
 from mcsim.sphere.checks import UNSEEN_BELOW
@@ -21,13 +22,7 @@ from mcsim.support.folders import user_path
 
 def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
     """Return the map, called ``name``, if it can be of the survey; else raise InputError."""
-    if map_.shape != (12 * model.nside**2,):
-        size = healpy.npix2nside(map_.size) if map_.ndim == 1 and healpy.isnpixok(map_.size) else None
-        found = f"the shape {map_.shape}" if size is None else f"nside {size}"
-        remedy = "set map.nside of the model to that of the data, or say in [[preparation]] how they were degraded"
-        if model.survey.config.preparation and size == model.survey.config.map.nside:
-            remedy = "do to the data what [[preparation]] does to simulations (mcsim prepare)"
-        raise InputError(f"{name} has {found}, the model {model.nside}; {remedy}.")
+    _check_size(model.survey.config, map_, name)
     broken = int(np.sum(~np.isfinite(map_)))
     if broken:
         raise InputError(f"{name} has {broken} pixels that are not finite; mark what was not observed as UNSEEN.")
@@ -61,6 +56,34 @@ def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
     return map_
 
 
+def _check_size(run: config.RunConfig, map_: Map, name: str) -> None:
+    """Raise InputError for a map with other pixels than those of a run; one without pixels is refused as a model."""
+    nside = config.prepared_grid(run)[0]
+    if nside and map_.shape != (12 * nside**2,):
+        size = healpy.npix2nside(map_.size) if map_.ndim == 1 and healpy.isnpixok(map_.size) else None
+        found = f"the shape {map_.shape}" if size is None else f"nside {size}"
+        remedy = "set map.nside of the model to that of the data, or say in [[preparation]] how they were degraded"
+        if run.preparation and size == run.map.nside:
+            remedy = "do to the data what [[preparation]] does to simulations (mcsim prepare)"
+        raise InputError(f"{name} has {found}, the model {nside}; {remedy}.")
+
+
+def given_maps(run: config.RunConfig, data: str | Path | Sequence[Map] | Mapping[str, Map]) -> dict[str, Map]:
+    """Return the maps of a folder, or given ones, in the order of the run's, uK, by the names of messages.
+
+    InputError is raised for what :func:`read_maps` and :func:`checked` refuse without a model, which may take minutes.
+    """
+    return _read(run, data) if isinstance(data, str | Path) else _taken(run, data)
+
+
+def checked_maps(model: Model, given: Mapping[str, Map]) -> list[Map]:
+    """Return the maps of :func:`given_maps` if they can be of the survey; else raise InputError."""
+    named = zip(model.parts, given.items(), strict=True)
+    maps = [checked_map(model, part, map_, name) for part, (name, map_) in named]
+    check_differ(model, maps, list(given))
+    return maps
+
+
 def read_maps(model: Model, folder: str | Path) -> list[Map]:
     """Read the maps of every channel and split, in the order of the model's, uK.
 
@@ -70,14 +93,7 @@ def read_maps(model: Model, folder: str | Path) -> list[Map]:
     survey: not finite, constant, without what the fiducial scan hits, or far from the size of the model. Other FITS
     files are not read, which a warning says.
     """
-    folder, names = user_path(folder), file_names(model.survey.config)
-    if not folder.is_dir():
-        first = names[model.parts[0].name]
-        raise InputError(f"{folder} is no folder; give one with the observed maps, {first} and so on.")
-    maps = [_read(model, part, folder / names[part.name]) for part in model.parts]
-    _warn_of_others(path.name for path in folder.glob("*.fits*") if path.name not in names.values())
-    check_differ(model, maps, [str(folder / names[part.name]) for part in model.parts])
-    return maps
+    return checked_maps(model, _read(model.survey.config, folder))
 
 
 def of_pixel_means(model: Model, folder: str | Path) -> bool:
@@ -96,24 +112,7 @@ def checked(model: Model, maps: Sequence[Map] | Mapping[str, Map]) -> list[Map]:
 
     InputError as well for attributes ``frame`` or ``ordering`` that are not the model's and RING.
     """
-    names = [part.name for part in model.parts]
-    if isinstance(maps, Mapping):
-        lacking = [name for name in names if name not in maps]
-        if lacking:
-            raise InputError(f"the maps lack {lacking[0]}; the model has {', '.join(names)}.")
-        _warn_of_others(str(name) for name in maps if name not in names)
-        maps = [maps[name] for name in names]
-    if not isinstance(maps, Sequence | np.ndarray):
-        raise InputError(f"the maps are a {type(maps).__name__}; give a folder, or arrays for {', '.join(names)}.")
-    if len(maps) != len(model.parts):
-        raise InputError(f"{len(maps)} maps were given, the model has {len(model.parts)}; give one for each.")
-    named = [(part, f"map {part.name}") for part in model.parts]
-    found = []
-    for (part, name), map_ in zip(named, maps, strict=True):
-        frequency_ghz = model.survey.channels[part.channel].site.frequency_ghz
-        found.append(checked_map(model, part, in_uk(map_, name, model.frame, frequency_ghz), name))
-    check_differ(model, found, [name for _, name in named])
-    return found
+    return checked_maps(model, _taken(model.survey.config, maps))
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -140,13 +139,44 @@ def check_differ(model: Model, maps: Sequence[Map], names: Sequence[str]) -> Non
             raise InputError(f"{copied} is the same map as {name}; give each channel and split its own.")
 
 
-def _read(model: Model, part: Part, path: Path) -> Map:
-    if not path.is_file():
-        inside = first_realization(path.parent)
-        remedy = "give it under that name" if inside == path.parent else f"give the folder of a realization, {inside}"
-        known = file_names(model.survey.config).values()
-        other = _listed(each.name for each in path.parent.iterdir() if each.is_file() and each.name not in known)
-        beside = f" (the folder has {other})" if other else ""
-        raise InputError(f"{path} does not exist; the model has a map {part.name}, {remedy}{beside}.")
-    map_ = read_uk(path, model.frame, model.survey.channels[part.channel].site.frequency_ghz)
-    return checked_map(model, part, map_, str(path))
+def _read(run: config.RunConfig, folder: str | Path) -> dict[str, Map]:
+    """Read the maps of a folder, by path; warn of others."""
+    folder, names, found = user_path(folder), file_names(run), {}
+    if not folder.is_dir():
+        first = next(iter(names.values()))
+        raise InputError(f"{folder} is no folder; give one with the observed maps, {first} and so on.")
+    for part in parts_of(run):
+        path = folder / names[part.name]
+        if not path.is_file():
+            inside = first_realization(folder)
+            remedy = "give it under that name" if inside == folder else f"give the folder of a realization, {inside}"
+            known = names.values()
+            other = _listed(each.name for each in folder.iterdir() if each.is_file() and each.name not in known)
+            beside = f" (the folder has {other})" if other else ""
+            raise InputError(f"{path} does not exist; the model has a map {part.name}, {remedy}{beside}.")
+        found[str(path)] = read_uk(path, part.frame, part.frequency_ghz)
+        _check_size(run, found[str(path)], str(path))
+    _warn_of_others(path.name for path in folder.glob("*.fits*") if path.name not in names.values())
+    return found
+
+
+def _taken(run: config.RunConfig, maps: Sequence[Map] | Mapping[str, Map]) -> dict[str, Map]:
+    """Take given maps, by name or in the order of the run's; warn of others."""
+    parts = list(parts_of(run))
+    names = [part.name for part in parts]
+    if isinstance(maps, Mapping):
+        lacking = [name for name in names if name not in maps]
+        if lacking:
+            raise InputError(f"the maps lack {lacking[0]}; the model has {', '.join(names)}.")
+        _warn_of_others(str(name) for name in maps if name not in names)
+        maps = [maps[name] for name in names]
+    if not isinstance(maps, Sequence | np.ndarray):
+        raise InputError(f"the maps are a {type(maps).__name__}; give a folder, or arrays for {', '.join(names)}.")
+    if len(maps) != len(parts):
+        raise InputError(f"{len(maps)} maps were given, the model has {len(parts)}; give one for each.")
+    found = {}
+    for part, map_ in zip(parts, maps, strict=True):
+        name = f"map {part.name}"
+        found[name] = in_uk(map_, name, part.frame, part.frequency_ghz)
+        _check_size(run, found[name], name)
+    return found

@@ -18,7 +18,7 @@ from mcsim.datavector.analysis import Analysis, Job, analysis_of, check_asked, d
 from mcsim.datavector.campaign import asking, batch
 from mcsim.datavector.candidate import TemplateBank
 from mcsim.datavector.kept import Kept
-from mcsim.datavector.map_checks import checked, of_pixel_means, read_maps
+from mcsim.datavector.map_checks import checked_maps, given_maps, of_pixel_means
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.seeds import Checked
 from mcsim.datavector.settings import DiagnosisSettings
@@ -36,6 +36,7 @@ from mcsim.errors import InputError
 from mcsim.reconstruction import simulated_scores
 from mcsim.simulation import power
 from mcsim.support import folders
+from mcsim.support.arrays import Map
 from mcsim.support.code import LIBRARIES, class_digest, package_digest
 from mcsim.support.settings import settings_of
 
@@ -101,14 +102,11 @@ def diagnose(
         folders.writable(output)
     processes = run.compute.workers if workers is None else workers
     load_ahead(processes)
-    run, analysis, table = _analysed(run, source, data, settings, library, wanted)
+    run, analysis, table, given = _analysed(run, source, data, settings, library, wanted)
     check_asked(analysis, asked)
     task: Callable[[Job], NDArray[np.float64]] = data_vectors if table is None else table
-    maps: Sequence[NDArray[np.float64]] = ()
-    means = False
-    if table is None:
-        maps = read_maps(analysis.model, data) if isinstance(data, str | Path) else checked(analysis.model, data)
-        means = isinstance(data, str | Path) and of_pixel_means(analysis.model, data)
+    maps = checked_maps(analysis.model, given) if given else []
+    means = bool(given) and isinstance(data, str | Path) and of_pixel_means(analysis.model, data)
     key = _key(run, analysis)
     with batch(processes) as call:
         whole = task if source is None else Checked(task)
@@ -169,10 +167,10 @@ def describe(
     """
     run, source = loaded(model)
     count, (settings, library, asked) = settings.controls, _with_library(settings)
-    run, analysis, table = _analysed(run, source, data, settings, library, count)
+    run, analysis, table, maps = _analysed(run, source, data, settings, library, count)
     check_asked(analysis, asked)
-    if data is not None and table is None:
-        read_maps(analysis.model, data)
+    if maps:
+        checked_maps(analysis.model, maps)
     campaign.check_count(analysis, settings.simulations)
     planned, size = campaign.plan(analysis, settings.simulations), len(analysis.elements)
     jobs = planned.values()
@@ -201,13 +199,15 @@ def _analysed(
     settings: DiagnosisSettings,
     library: systematics.Library,
     wanted: int,
-) -> tuple[config.RunConfig, Analysis, spectra_table.Spectra | None]:
-    """Return the run, with the statistics of a table that the data may be, the analysis of the data, and the table.
+) -> tuple[config.RunConfig, Analysis, spectra_table.Spectra | None, dict[str, Map]]:
+    """Return the run, with the statistics of a table that the data may be, the analysis of the data, table and maps.
 
-    InputError is raised for ``wanted`` controls, a simulator or a sky that do not suit the data.
+    InputError is raised for ``wanted`` controls, a simulator or a sky that do not suit the data, and before all else
+    for data that cannot be read.
     """
     threads = os.cpu_count() or 1
     table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
+    given = {} if data is None or table is not None else given_maps(run, data)
     controls.check(wanted, of_maps=table is None, external=source is not None)
     if table is not None:
         if source is not None:
@@ -222,7 +222,7 @@ def _analysed(
             "fewer out (--without), or give others (library)."
         )
     power.check(analysis.model.survey)
-    return run, analysis, table
+    return run, analysis, table, given
 
 
 def _with_agreement(diagnosis: DiagnosisResult, found: Agreement) -> DiagnosisResult:

@@ -52,6 +52,24 @@ def test_the_cost_of_a_diagnosis_is_said_of_data_that_can_be_used(small, folder)
         api.describe(small.run, settings, folder)
 
 
+def test_data_that_cannot_be_read_are_refused_before_the_survey_is_prepared(small, folder, monkeypatch):
+    monkeypatch.setattr(api, "analysis_of", None)
+    cut = folder / "cut"
+    shutil.copytree(folder, cut)
+    (cut / "V1_half2.fits").write_bytes((folder / "V1_half2.fits").read_bytes()[:4000])
+    write(folder, "W1:half2", np.ones(12 * 8**2))
+    for data, named in (
+        (folder / "nosuch", (folder / "nosuch", "V1_half1.fits")),
+        (cut, (cut / "V1_half2.fits",)),
+        (folder, ("W1_half2.fits", "nside 8", 16)),
+        ({"V1:half1": np.zeros(3072)}, ("V1:half2",)),
+    ):
+        with refused(*named):
+            mcsim.diagnose(small.run, data)
+    with refused(folder / "nosuch"):
+        api.describe(small.run, DiagnosisSettings(), folder / "nosuch")
+
+
 def test_what_cannot_be_done_is_said_before_anything_is_learned(small, folder):
     (folder / "file").write_text("")
     for changes, named in (
