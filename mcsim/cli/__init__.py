@@ -22,7 +22,6 @@ from mcsim.cli.common import (
     Group,
     Including,
     Png,
-    Processes,
     Scheduler,
     Simulations,
     Workers,
@@ -194,7 +193,7 @@ def diagnose(
     simulations: Simulations = None,
     quick: Annotated[bool, Option("--quick", help="First verdict, from fewer simulations.")] = False,
     controls: Annotated[int, Option(min=0, help="Perfect data sets, drawn at higher fidelity and diagnosed too.")] = 0,
-    workers: Processes = None,
+    workers: Workers = None,
     scheduler: Scheduler = None,
     dry_run: Annotated[bool, Option("--dry-run", help="Read DATA; say what it takes; no verdict.")] = False,
 ) -> None:
@@ -214,8 +213,8 @@ def diagnose(
         without=tuple(without or ()), including=tuple(including or ()), simulations=simulations, controls=controls
     )
     if dry_run:
-        number = processes(where) or run.compute.workers
-        run = replace(run, compute=replace(run.compute, workers=number))
+        if (number := processes(where)) is not None:
+            run = replace(run, compute=replace(run.compute, workers=max(number, 1)))
         print(describe(run, settings, data))
         return
     if output is None:

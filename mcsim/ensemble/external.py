@@ -29,6 +29,8 @@ SEEDS = 1 << 20  #: realizations of a stream of seeds
 LARGEST = 1 << 16
 """Bytes of a pickled simulator up to which it goes with every task; a larger one is a file in the cache."""
 
+_NO_CHILDREN = "daemonic processes are not allowed to have children"  #: what multiprocessing says (process.py)
+
 _GOLDEN = 2654435769  #: 2^32 over the golden ratio, odd: multiples modulo 2^32 are all different, and far apart
 
 
@@ -55,9 +57,11 @@ class Code(Source):
         except InputError:
             raise
         except (Exception, SystemExit) as error:  # whatever a foreign program does
-            reason = str(error).partition("\n")[0]
+            reason, remedy = str(error).partition("\n")[0], "mend it"
+            if _NO_CHILDREN in reason:  # workers of Dask are such processes, so that none outlives its driver
+                remedy = "call it in the process that starts mcsim, with --workers 0 (workers=0 in Python)"
             raise RunError(
-                f"{self.words(seed, realization)} fails ({type(error).__name__}: {reason}); mend it."
+                f"{self.words(seed, realization)} fails ({type(error).__name__}: {reason}); {remedy}."
             ) from error
 
 

@@ -1,7 +1,9 @@
 """Stored maps of another program: which files a template names, and what their attributes say."""
 
+import multiprocessing
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import xarray as xr
 from mcsim import config
 from mcsim.ensemble.external import source_of
 from mcsim.ensemble.external_maps import Part, fits_maps, in_order
+from mcsim.errors import RunError
 from refusals import refused
 
 PARTS = (Part("V", "V", None, None, "galactic"),)
@@ -113,3 +116,16 @@ def test_a_realization_that_lacks_a_map_is_not_left_out_in_silence(lost: str, tm
     (tmp_path / lost).unlink()
     with refused(tmp_path / lost, lost[0], 2):
         fits_maps(parts, str(tmp_path / "{channel}_{realization}.fits"))
+
+
+def in_a_pool(seed: int, effects: Any = ()) -> dict[str, Any]:
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        return {"V": pool.map(abs, range(12))}
+
+
+def test_a_simulator_with_processes_of_its_own_is_told_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers of Dask are daemonic, so that none is left if the driver is killed; the advice was to mend it."""
+    source = source_of(config.load("tiny"), in_a_pool)
+    monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)  # type: ignore[attr-defined]
+    with refused("in_a_pool", "AssertionError", "--workers 0", by=RunError):
+        source.maps(1, 0)
