@@ -115,7 +115,7 @@ def score_figure(score: Score, answers: Confusion, bayes: Confusion) -> Figure:
     classifier; the confusion matrices of both.
     """
     figure = Figure(figsize=(15.0, 16.0), layout="constrained")
-    figure.suptitle(score.title, fontsize=13)
+    figure.suptitle(score.title, fontsize=13, parse_math=False)
     upper, lower = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 1.05)), dtype=object))
     panels = (_calibration, _power, _unknown, _pulls, _reduction, _right)
     for axes, panel in zip(upper.subplots(2, 3).flat, panels, strict=True):
@@ -224,6 +224,7 @@ def _matrix(axes: Axes, matrix: Confusion, title: str) -> None:
         if count:
             colour = "w" if shares[i, j] > 0.5 else "k"
             axes.text(j, i, str(count), ha="center", va="center", fontsize=8, color=colour)
-    axes.set_xticks(range(len(matrix.answers)), map(_words, matrix.answers), rotation=90, fontsize=8)
-    axes.set_yticks(range(len(matrix.truths)), map(_words, matrix.truths), fontsize=8)
+    style: dict[str, Any] = {"fontsize": 8, "parse_math": False}
+    axes.set_xticks(range(len(matrix.answers)), map(_words, matrix.answers), rotation=90, **style)
+    axes.set_yticks(range(len(matrix.truths)), map(_words, matrix.truths), **style)
     axes.set(xlabel="Answer", ylabel="Truth")

@@ -76,7 +76,7 @@ def _draw_map(axes: Axes, values: NDArray[np.float64], title: str) -> None:
         vmin=middle - largest,
         vmax=middle + largest,
     )
-    axes.set_title(f"{title}: rms {number(float(np.nanstd(values)))} µK", fontsize=10)
+    axes.set_title(f"{title}: rms {number(float(np.nanstd(values)))} µK", fontsize=10, parse_math=False)
     axes.axis("off")
     axes.figure.colorbar(
         shown, ax=axes, orientation="horizontal", shrink=0.7, aspect=30, pad=0.02, ticks=MaxNLocator(4)
@@ -97,7 +97,7 @@ def _draw_words(axes: Axes, channel: ChannelResult) -> None:
     axes.axis("off")
     lines += ["or " + " and ".join(d.words for d in one) for one in channel.alternatives]
     text = "\n".join([channel.verdict, *lines])
-    axes.text(0.05, 0.9, text, va="top", fontsize=11, linespacing=1.5, transform=axes.transAxes)
+    axes.text(0.05, 0.9, text, va="top", fontsize=11, linespacing=1.5, transform=axes.transAxes, parse_math=False)
 
 
 def _draw_spectra(axes: Axes, channel: ChannelResult) -> None:

@@ -33,11 +33,12 @@ def limit_figure(found: Limits) -> Figure:
     style: dict[str, Any] = {"markersize": 9, "markeredgewidth": 1.6, "linestyle": "none", "color": "black"}
     left.plot(apart[inside], rows[inside], marker="|", label="told apart from the most similar", **style)
     left.plot([0.97 * REACH] * int(np.sum(beyond)), rows[beyond], marker="$>$", label="beyond", **style)
+    beside: dict[str, Any] = {"va": "center", "fontsize": 7, "parse_math": False}
     for row, one in enumerate(effects):
         unit = "" if one.unit.startswith("1") else f" ({one.unit})"
         shown = f"{number(one.sigma)} | {number(one.amplitude_90)}{unit}"
-        left.annotate(shown, (1.0, row), (4, 0), ("axes fraction", "data"), "offset points", va="center", fontsize=7)
-    left.set_yticks(rows, [one.title for one in effects], fontsize=8)
+        left.annotate(shown, (1.0, row), (4, 0), ("axes fraction", "data"), "offset points", **beside)
+    left.set_yticks(rows, [one.title for one in effects], fontsize=8, parse_math=False)
     left.set_ylim(count - 0.4, -0.6)
     left.set_xlim(0.0, REACH)
     left.set_xlabel("amplitude / sigma;  at the right: sigma | detected among all", fontsize=9)
@@ -47,7 +48,7 @@ def limit_figure(found: Limits) -> Figure:
     steps = np.digitize(np.minimum(found.correlation, 0.999999), levels) - 0.5
     image = right.imshow(steps, cmap=shades, vmin=0, vmax=6, aspect="auto")
     right.set_ylim(left.get_ylim())
-    right.set_xticks(rows, [one.title for one in effects], fontsize=7, rotation=90)
+    right.set_xticks(rows, [one.title for one in effects], fontsize=7, rotation=90, parse_math=False)
     right.set_yticks(rows, [""] * count)
     right.set_title("canonical correlation |ρ| of the responses", fontsize=10)
     bar = figure.colorbar(image, ax=right, ticks=range(7), shrink=0.7, aspect=40)

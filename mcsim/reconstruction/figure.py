@@ -28,7 +28,7 @@ def structure_figure(found: Reconstructed, frame: str) -> Figure | None:
             reach = float(np.nanmax(np.abs(values))) or 1.0
             style: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -reach, "vmax": reach, "interpolation": "nearest"}
             shown = mollweide(axes, values, 600, **style)
-            axes.set_title(f"{found.picture_of.replace(':', ' ')}, {frame}", fontsize=9)
+            axes.set_title(f"{found.picture_of.replace(':', ' ')}, {frame}", fontsize=9, parse_math=False)
             figure.colorbar(shown, ax=axes, orientation="horizontal", shrink=0.7, label="µK")
             continue
         low, high, size, sigma = np.array(found.profile).T

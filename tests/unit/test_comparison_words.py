@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from mcsim.comparison import report
 from mcsim.comparison.effects import EffectDifference
 from mcsim.comparison.result import ChannelResult, DifferenceResult, NotCompared
 from mcsim.systematics.beams import BeamSidelobe
@@ -52,3 +53,17 @@ def test_maps_without_any_difference_are_not_called_accurate_to_zero(rms, words)
         *(maps, maps, maps, maps == 0.0, 0, None, ("W",)),
     )
     assert found.sentence() == f"W: identical {words}"
+
+
+def test_names_with_the_signs_of_mathematics_are_drawn_as_they_are() -> None:
+    """matplotlib failed on them, after all was computed: nothing was written."""
+    one = DifferenceResult("one", "a$_$b", 1.0, "K", 1.0, {"at": "c$_$d"}, "")
+    maps = np.arange(12.0)[None]
+    found = ChannelResult(
+        *("a$_$b", ("a$_$b",), "difference", (one,), (), (), 0.0),
+        *(1.0, 100.0, 0.0, 0.0, 0.0, (), 0.0),
+        *(maps, maps + 1.0, maps, maps >= 0.0, 0, None, ("a$_$b",)),
+    )
+    picture = report.figure(found)
+    picture.draw_without_rendering()
+    assert "A: a$_$b" in picture.axes[0].get_title()

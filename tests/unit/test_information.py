@@ -21,6 +21,7 @@ from mcsim.bipolar.theory import fisher_information
 from mcsim.cli import app
 from mcsim.datavector.campaign import with_effects
 from mcsim.information.api import describe, widths
+from mcsim.information.figure import limit_figure
 from mcsim.information.result import Limits, canonical_correlations, marginalised
 from mcsim.simulation import simulate
 from mcsim.simulation.inverse_covariance import unit_skies
@@ -436,6 +437,8 @@ def test_limits_are_written_and_say_what_they_are(tmp_path) -> None:
     with xr.open_zarr(tmp_path / "out" / "limit.zarr") as stored:
         np.testing.assert_array_equal(stored.fisher, found.fisher)
     assert (tmp_path / "out" / "limit.png").stat().st_size > 10_000
+    odd = tuple(replace(one, title="a$_$b", unit="c$_$d") for one in found.effects)  # what matplotlib cannot parse
+    limit_figure(replace(found, effects=odd)).draw_without_rendering()
     assert any(line.startswith("noise_level (V1)") for line in found.lines())
     unknown = replace(found, settings=replace(found.settings, nuisances={"beam_width": 0.01}, unknown_dipole_uk=10.0))
     assert unknown.lines()[-1] == "Marginalised over beam_width ± 0.01, a monopole and dipole of 10 µK rms."
