@@ -57,7 +57,12 @@ def make(
     including = (str(Path(name).resolve()) if name.endswith(".py") else name for name in settings.including)
     settings = replace(settings, including=tuple(including))
     for channel in survey(settings.model).channels if settings.sampled_share > 0.0 or file else ():
-        sampled.check(channel)
+        try:
+            sampled.check(channel)
+        except InputError as error:
+            if file is not None:  # what the library does not have is made sample by sample alone
+                raise
+            raise InputError(f"{str(error).rstrip('.')}, or make no map so (--sampled-share 0).") from None
     writable(target)
     names = [f"case-{number:03d}" for number in range(cases)]
     files.check_keys(target, names)

@@ -241,6 +241,12 @@ def test_a_share_is_from_nothing_to_all(share):
         Settings(config.load("quickstart"), sampled_share=share)
 
 
+def test_a_model_without_pointing_is_told_to_make_no_map_by_sample(tmp_path):
+    """It was told to take another scan alone."""
+    with refused("demo", "hit_averaged", "--sampled-share 0"):
+        make(Settings(config.load("tiny")), tmp_path / "made", 1, 0, workers=0)
+
+
 @pytest.mark.parametrize("number", [0, -3])
 def test_a_number_of_cases_is_positive(number, tmp_path):
     settings = Settings(config.load("quickstart"), sampled_share=0.0)
