@@ -99,9 +99,9 @@ def _drop(table: dict[str, Any], defaults: dict[str, Any]) -> None:
             del table[key]
 
 
-def digest(config: RunConfig) -> str:
+def digest(config: RunConfig, *others: str) -> str:
     """Return the SHA-256 of the canonical JSON of :func:`science`, in hexadecimal."""
-    return digest_of(science(config))
+    return digest_of(science(config, *others))
 
 
 def digest_of(found: dict[str, Any]) -> str:

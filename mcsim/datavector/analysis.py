@@ -104,8 +104,8 @@ class Analysis:
 
     @cached_property
     def content(self) -> str:
-        """Return the hash of the run and of its files."""
-        return config.digest(self.run)
+        """Return the hash of the run and of its files, those of its nuisances among them."""
+        return config.digest(self.run, "nuisance")
 
     def job(self, simulated: config.RunConfig) -> "Job":
         """Return a job of no realization yet that simulates a run and analyses it."""

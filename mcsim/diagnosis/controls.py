@@ -172,7 +172,12 @@ def diagnose_controls(known: DiagnosisContext, key: str, count: int, call: Batch
     verdicts = {number: one for number in range(count) if (one := _read(folder, number)) is not None}
     missing = [number for number in range(count) if number not in verdicts]
     absent = [number for number in missing if not _maps(folder, number).is_dir()]
-    fixed = config.to_json(drawn.run), config.digest(drawn.run), known.analysis.library, drawn.sample_by_sample
+    fixed = (
+        config.to_json(drawn.run),
+        config.digest(drawn.run, "nuisance"),
+        known.analysis.library,
+        drawn.sample_by_sample,
+    )
     done = count - len(missing)
     with reporting("controls", float(count), "controls", quiet) as report, asking(call, quiet=True) as ask:
 

@@ -10,7 +10,7 @@ from scipy import stats
 import mcsim
 from instruments import two_channels
 from mcsim import config, systematics
-from mcsim.datavector.analysis import analysis_of
+from mcsim.datavector.analysis import analysis_of, simulated_maps
 from mcsim.datavector.candidate import Candidate, numbered
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
@@ -244,6 +244,22 @@ def test_nuisances_are_part_of_a_diagnosis_and_not_of_an_ensemble(tmp_path):
     assert "nuisance: residual foreground, template" in describe(run, settings)
     assert "2.0 µK" in describe(run, settings)
     assert "nuisance: " not in describe(plain, settings)
+
+
+def test_a_template_that_is_written_anew_is_read_anew(tmp_path):
+    """A process kept the survey of the old one, and responses were those to its pattern."""
+    given = {"effect": "noise_anisotropy", "channel": "V1", "width": 0.1, "parameters": {"template": "t.fits"}}
+    maps = []
+    for power in (1, 4):
+        healpy.write_map(
+            tmp_path / "t.fits", np.linspace(0, 1, 192) ** power, coord="E", dtype=np.float64, overwrite=True
+        )
+        run = config.load(config.to_dict(model()) | {"nuisance": [given]}, base=tmp_path)
+        own = {"amplitude": 0.5} | run.nuisances[0].parameters
+        table = config.Effect(name="noise_anisotropy", channel="V1", parameters=own)
+        analysis = analysis_of(run, tuple(name for name in systematics.catalogue() if name != "noise_level"))
+        maps += simulated_maps(replace(analysis.job(replace(run, effects=(table,))), count=1))
+    assert not np.array_equal(maps[0][0], maps[1][0])
 
 
 def ensemble_of(simulations, nuisances, folds=None):
