@@ -49,7 +49,7 @@ class EffectDifference(Difference):
         self.kind, self.templates, self.run, self.sky = kind, templates, run, sky
         self.name, self.unit, self.met = kind.name, kind.unit, kind.cause
         self.linear = kind.name != GAIN
-        self._there: dict[tuple[bytes, float, tuple[float, float] | None], Maps] = {}
+        self._there: dict[tuple[Any, ...], Maps] = {}  # by what the templates depend on
         self._products = np.tensordot(templates, templates, ((1, 2), (1, 2))) / templates[0].size
         power = healpy.alm2cl(sky)
         self._largest = float((2 * np.arange(power.size) + 1) @ power) / (4.0 * np.pi)
@@ -76,10 +76,11 @@ class EffectDifference(Difference):
         scene, pair = state.scene, state.pair
         if scene is None or not (scene.late or scene.motion):
             return self.templates
-        # A few per cent of a shift do not matter.
-        scene = replace(scene, late=float(f"{scene.late:.2g}"), sky=self.sky)
+        # A few per cent of a shift or a turn do not matter.
+        late, turn = (float(f"{value:.2g}") for value in (scene.late, scene.psi[1]))
+        scene = replace(scene.turned(turn - scene.psi[1]), late=late, sky=self.sky)
         periods = None if scene.motion is None else (scene.motion.spin_period_s, scene.motion.precession_period_s)
-        key = scene.beam.blm.tobytes(), scene.late, periods
+        key = scene.beam.blm.tobytes(), scene.window.tobytes(), (late, turn, scene.psi[0], scene.centred), periods
         if key not in self._there:
             basis = basis_of(self.kind)
             try:
