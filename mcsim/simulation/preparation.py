@@ -131,7 +131,9 @@ class Preparation:
         """Return hits, sums over the prepared pixels, and orientation moments, plain means as of the temperatures."""
         hits, w = moments.hits, np.where(moments.hits > 0, moments.w, np.nan)
         for step in self.steps:
-            hits, w = step.local(hits), step.orientations(w)
+            hits = step.local(hits)
+            # A file of moments has no orders for a beam that is circular.
+            w = step.orientations(w) if len(w) else np.zeros((0, hits.size), dtype=np.complex128)
         hits = hits * (moments.nside / self.nside) ** 2
         moved = self.nside != moments.nside or self.frame != moments.frame
         found = Moments(self.nside, self.frame, np.nan_to_num(hits), np.nan_to_num(w))

@@ -7,6 +7,7 @@ from astropy.io import fits
 
 import mcsim
 from mcsim import config
+from mcsim.instrument import scan
 from mcsim.plot.look import look_at_beams
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -169,3 +170,21 @@ def test_tables_that_leave_a_choice_are_refused(lfi, tmp_path):
         mcsim.Beam.from_window(image)
     with refused(tmp_path / "none.fits", by=mcsim.InputError):
         mcsim.Beam.from_window(tmp_path / "none.fits")
+
+
+def test_maps_of_a_file_of_moments_are_prepared(tmp_path):
+    """Its orders do not count for a circular beam, which sees what it sees under parallel transport."""
+    path, npix = tmp_path / "moments.fits", 12 * 32**2
+    scan.write_moments_fits(path, mcsim.Moments(32, "ecliptic", np.full(npix, 10.0), np.full((2, npix), 0.3 + 0.4j)))
+    run = {
+        "name": "prepared",
+        "sky": {"spectrum": "wmap7", "lmax": 40},
+        "map": {"nside": 32, "pixel_window": "none"},
+        "preparation": [{"kind": "rotate", "frame": "galactic"}, {"kind": "degrade", "nside": 16}],
+    }
+    channel = {"name": "W", "beam": {"kind": "window", "path": WINDOW}}
+    found, wanted = (
+        simulate.realize(survey(config.load(run | {"channel": [channel | {"scan": each}]})), 0)
+        for each in ({"kind": "moments", "path": str(path)}, {"kind": "parallel_transport"})
+    )
+    assert all(np.array_equal(found[name], wanted[name], equal_nan=True) for name in wanted)
