@@ -37,6 +37,20 @@ def test_layout_is_that_of_the_summary(small_store: Path) -> None:
     assert difference.dims == ("pair", "mode", "bin")
 
 
+def test_covariance_of_bins_is_diagonal_and_says_where_that_leaves_something_out() -> None:
+    run = table(biposh={"L_max": 2, "summary_bin": 1})
+    mask = np.linspace(0.0, 1.0, 12 * 16**2)
+    whole, masked = (prediction.predict(one) for one in (run, run | {"map": {"nside": 16, "mask": mask}}))
+    assert ["one bin with another" in one.left_out for one in (whole, masked)] == [False, True]
+    covariance, deviation = (masked[f"biposh_binned_{name}"].values for name in ("covariance", "standard_deviation"))
+    # Of single degrees some bins are empty, with NaN in their rows and columns, as in a summary.
+    empty = np.isnan(deviation)
+    assert empty.any()
+    np.testing.assert_array_equal(np.isnan(covariance), empty[..., None] | empty[..., None, :])
+    diagonal = np.eye(deviation.shape[-1]) * deviation[..., None] ** 2
+    np.testing.assert_allclose(np.nan_to_num(covariance), np.nan_to_num(diagonal), rtol=1e-12)
+
+
 def test_errors_of_the_control_are_those_of_a_circular_beam() -> None:
     beam = Beam.elliptical(300.0, 220.0, lmax=32)
     one = {"name": "W1", "scan": {"kind": "parallel_transport"}, "noise": {"sigma0_uk": 20.0}}
