@@ -16,7 +16,7 @@ from mcsim.comparison.effects import effects_of
 from mcsim.comparison.looks import look
 from mcsim.comparison.pairs import ChannelPair, Comparison, Given, given, read
 from mcsim.comparison.prediction import PRECISION, Set
-from mcsim.comparison.result import ChannelResult, ComparisonResult, DifferenceResult, Verdict
+from mcsim.comparison.result import UNMADE, ChannelResult, ComparisonResult, DifferenceResult, Verdict
 from mcsim.comparison.scene import Scene
 from mcsim.comparison.search import INTERPOLATING, Problem
 from mcsim.comparison.shown_sky import adds_orders, with_fewer_orders, with_shown_sky
@@ -159,9 +159,11 @@ def _either_way(pair: ChannelPair, others: Sequence[ChannelPair], sides: Compari
     named = found.verdict != "unknown"
     if problem is None or pair.scene is None or found.verdict == "identical" or (named and unexplained < accepted):
         return found
+    # An effect of side A changes the sky that its maps show through the model's beam, and may have no name there.
+    not_made = problem.unmade > UNMADE * found.rms_uk
     turned_pair, turned_others = pair.exchanged(), [other.exchanged() for other in others]
     shown = turned_pair if problem.pair.doubt is None else with_shown_sky(turned_pair)
-    if not problem.worse_alone_than(problem.of_pair(shown, turned_others)):
+    if not (not_made or problem.worse_alone_than(problem.of_pair(shown, turned_others))):
         return found
     turned, *_ = _explained(turned_pair, turned_others, sides, accuracy)
     worse = named and turned.left > CLEARLY * found.left
@@ -188,9 +190,7 @@ def _explained(
     problem = Problem(pair, others, accuracy * sky, library(sides.frame))
     sets = problem.best()
     if sides.run is not None and not (sets and problem.complete(sets[0])):
-        # An effect of side A is one of side B with the other sign, and was found before sides are exchanged.
-        if not second:
-            problem = replace(problem, library=(*problem.library, *effects_of(pair, sides.run)))
+        problem = replace(problem, library=(*problem.library, *effects_of(pair, sides.run)))
         sets = problem.best(1)
         there = problem.scene(sets[0].members) if sets and not second else None
         if there is not None and not problem.complete(sets[0]) and _correlation(pair, there) < SAME_SKY:

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 from mcsim.support.arrays import Maps
 from mcsim.support.numbers import number
 
+UNMADE = 0.2
+"""Share of the rms of a difference that the model leaves of its own side at least where it is said not to make it."""
+
 Verdict = Literal["identical", "difference", "mixture", "degenerate", "unknown"]
 
 
@@ -144,7 +147,7 @@ class ChannelResult:
             near, share = " and ".join(d.name for d in self.nearest), self.nearest_explains
             part = f"{100 * share:.0f}" if share < 0.99 else f"{100 * min(share, 0.9999):.2f}"
             hint = f"; nearest is {near}, which explains {part} %" if near and share >= 0.01 else ""
-            if self.unmade_rms_uk > 0.2 * self.rms_uk:
+            if self.unmade_rms_uk > UNMADE * self.rms_uk:
                 hint += (
                     f". The model makes {self.described} itself to {number(self.unmade_rms_uk)} uK rms only: "
                     "check it, or give it the sky (sky.alm), which maps with noise or many holes do not show"

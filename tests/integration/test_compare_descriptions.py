@@ -388,6 +388,18 @@ def test_a_side_is_described_through_the_beam_that_its_effects_make(tmp_path, ow
     assert found.channels[0].left < 1e-3
 
 
+@pytest.mark.parametrize(("name", "size"), [("beam_coma", 0.1), ("beam_ellipticity", 0.3)])
+def test_an_effect_of_side_a_is_named_whoever_gives_the_model(tmp_path, name, size):
+    """Through the model's beam a coma was *unknown*, and an ellipse had a beam beside it that is 3 % smaller."""
+    sides = acting(tmp_path, "a", (name, size)), acting(tmp_path, "b")
+    folders = [mcsim.write_maps(side, tmp_path / side.stem, realizations=0)[0] for side in sides]
+    found = mcsim.compare(*folders, sides[1])
+    assert names(found) == [name]
+    assert found.channels[0].differences[0].amplitude == pytest.approx(size, rel=0.02)
+    assert found.channels[0].left < 1e-3
+    assert found.to_dict()["model_describes"] == {"W1": "b"}
+
+
 def test_other_effects_of_a_description_are_warned_of(tmp_path):
     own = ("pointing_offset", 60.0), ("beam_width", 0.2)
     with pytest.warns(UserWarning, match=r"plain has effects \(pointing_offset\).*relative to the survey without them"):
