@@ -45,7 +45,10 @@ CONVENTIONS = {
     "alm": "healpy m-major order, analysis divided by the pixel window",
     "psi": "rotation of the beam about its axis, from e_theta (south) towards e_phi (east)",
     "beam": "b_lm of the beam at the pole, b_l0 = sqrt((2l+1)/4pi) B_l, B_0 = 1; x axis = spin axis x boresight",
+    "sample": "T(n, psi) = sum_s e^{-i s psi} S_s(n), S_s = sum_lm k_l a_lm b_ls sY_lm(n), k_l = sqrt(4pi/(2l+1)), "
+    "b_{l,-s} = (-1)^s conj(b_ls); hit average: w_s = <e^{-i s psi}> in place of e^{-i s psi}",
     "biposh": CONVENTION,
+    "modes": "M >= 0, both parities of l1 + l2 + L; one map: 0 <= d <= L but d = 0 of odd L; a pair: -L <= d <= L",
     "normalisation": NORMALISATION,
     "weights": "maps times weights of unit mean square, spectra over the mean product of the two weights",
 }

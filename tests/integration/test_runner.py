@@ -54,6 +54,16 @@ def test_store_holds_what_a_realization_gives(small_store: Path) -> None:
         assert all("long_name" in variable.attrs for variable in stored.variables.values())
 
 
+def test_store_says_all_conventions_that_its_arrays_rest_on(small_store: Path) -> None:
+    with open_ensemble(small_store) as stored:
+        said = stored.conventions
+        assert stored.M.min() == 0
+        assert {0, 1} == set(((stored.L + stored.d) % 2).values)
+    assert {"temperature", "alm", "psi", "beam", "sample", "biposh", "modes", "normalisation"} <= set(said)
+    assert "sum_s e^{-i s psi} S_s" in said["sample"]
+    assert "M >= 0, both parities" in said["modes"]
+
+
 def test_summary_is_that_of_the_realizations(small_store: Path) -> None:
     with open_ensemble(small_store) as stored, opening.open_summary(small_store) as summary:
         difference = (stored.biposh - stored.biposh_circular).values
