@@ -192,8 +192,11 @@ class OrientationAveraging(Effect):
     model: str = ""
 
     def orientations(self, moments: Moments, site: Site) -> Moments:
-        """Mix the moments; pixels that the real scan does not reach stay as they are."""
-        if self.amplitude == 0.0:
+        """Mix the moments; pixels that the real scan does not reach stay as they are.
+
+        Of a circular beam a file of moments has none to mix.
+        """
+        if self.amplitude == 0.0 or moments.smax == 0:
             return moments
         if self.model:
             real = ScanModel.load(self.model)

@@ -337,6 +337,8 @@ def test_orientations_are_mixed_with_those_of_the_scan(site):
     np.testing.assert_array_equal(found.w[:, ~seen], believed.w[:, ~seen])
     with refused("orientation_averaging", "W1", "scan.model"):
         effect.orientations(believed, replace(site, pointing=None))
+    circular = replace(believed, w=believed.w[:0])  # what is read of a file for a circular beam
+    assert effect.orientations(circular, site).w.shape == (0, believed.npix)
 
 
 def test_a_differencing_scan_is_less_balanced_and_solved_for_less():
