@@ -47,7 +47,15 @@ class Shape:
 
     @property
     def sigma(self) -> float:
-        """Return sigma of the Gaussian that has the beam's solid angle (integral over central value), radians."""
+        """Return sigma of the Gaussian that has the beam's solid angle (integral over central value), radians.
+
+        InputError for a beam that is not positive at its centre.
+        """
+        if self.peak <= 0.0:
+            raise InputError(
+                f"the effect counts distances in widths of the beam, which is {self.peak:.3g} sr^-1 at its centre and "
+                "should be above 0; leave the effect out, or centre the beam on its peak."
+            )
         return float(np.sqrt(np.sqrt(4.0 * np.pi) * self.whole.blm[0, 0].real / self.peak / (2.0 * np.pi)))
 
     def with_added(self, added: Values, least: int, keep_integral: bool = True) -> Beam:

@@ -312,6 +312,16 @@ def test_what_is_no_beam_is_refused():
         systematics.get("time_constant")(amplitude=0.1).pointing(beam, replace(site, pointing=None))
 
 
+@pytest.mark.parametrize("name", ["beam_coma", "beam_sidelobe"])
+def test_a_beam_that_is_not_positive_at_its_centre_has_no_width(name):
+    """A ring about a dip: the coefficients of the effect were not finite, and the beam had to be repaired."""
+    ell = np.arange(33)
+    window = np.exp(-0.5 * ell * (ell + 1.0) * 0.06**2) * (1.0 - 0.006 * ell * (ell + 1.0))
+    beam = Beam((np.sqrt((2 * ell + 1) / (4.0 * np.pi)) * window).astype(complex)[None])
+    with refused("-47.9", "0"):
+        systematics.get(name)(amplitude=0.05).beam(beam, site_of(beam))
+
+
 @pytest.mark.parametrize(("angle_deg", "said", "nearer_deg"), [(90.0, "+90°", 1.0), (-90.0, "−90°", -1.0)])
 def test_what_lies_across_the_scan_is_said_with_its_side(angle_deg, said, nearer_deg):
     """+90° is towards the spin axis, which starts at longitude 0 of the ecliptic in a scan without precession."""
