@@ -243,7 +243,7 @@ class DisturbedSurvey:
         if any(acts_through(effect, *_OF_BEAMS) for effect in more):
             beam = seen_through(acting, site)
             beam = beam.truncated(min(beam.mmax, *(m.moments.smax for m in channel.maps)))
-            response = convolve.response(beam, site.lmax, channel.window ** (spread_of(acting) ** 2))
+            response = convolve.response(beam, site.lmax, replace(channel, effects=acting).seen_window)
         moved = spread_of(acting) != 1.0  # signals of a direction are then not linear in coordinates
         bent = tuple(
             effect
