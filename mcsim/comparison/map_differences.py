@@ -155,6 +155,10 @@ class Ordering(Difference):
         return [way for way in super().starts(state) if _alike(self.maps(state.maps, way, state), state) > bare]
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
+        if state.pair.usable is not None:  # side B may have anything elsewhere
+            usable = self.undone(np.where(state.pair.usable, maps, healpy.UNSEEN), -value)
+            if _tells(usable != healpy.UNSEEN, state.pair.seen):
+                return _complete(usable, state)
         return _complete(self.undone(maps, -value), state)
 
     def undone(self, maps: Maps, value: Vector) -> Maps:
