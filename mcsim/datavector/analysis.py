@@ -18,7 +18,7 @@ from mcsim.datavector.summaries import Block, Element, blocks_of, of_map
 from mcsim.datavector.untouched_maps import UntouchedMaps, without_effects
 from mcsim.datavector.wiener_filter import Model, model_of, shared_sky, wiener_filter
 from mcsim.ensemble.external_maps import Source
-from mcsim.errors import InputError
+from mcsim.errors import InputError, RunError
 from mcsim.simulation import differencing, sampled, simulate
 from mcsim.simulation.channels import refuse_unseen
 from mcsim.simulation.nuisance import DisturbedSurvey, Nuisance, check_nuisances, nuisances_of
@@ -363,14 +363,15 @@ def _seed_and_added(simulated: str, fiducial: str) -> tuple[int, tuple[config.Ef
 def surveys(job: Job, library: Library | None = None) -> Iterator[tuple[int, Survey]]:
     """Yield every realization of a job with its survey: the same for all, but for the nuisances that each draws."""
     kinds = job.library if library is None else kinds_of(library)
-    known = job.simulated, kinds, job.content
+    known = job.simulated, kinds, job.fiducial, job.content
     disturbed = _disturbed(*known) if job.nuisances else None
     for realization in range(job.first, job.first + job.count):
         yield realization, _survey(*known) if disturbed is None else disturbed.at(realization)
 
 
 @lru_cache(maxsize=1)
-def _disturbed(simulated: str, kinds: Kinds, content: str) -> DisturbedSurvey:
+def _disturbed(simulated: str, kinds: Kinds, fiducial: str, content: str) -> DisturbedSurvey:
+    check_files(fiducial, content)
     return DisturbedSurvey.of(config.from_json(simulated), dict(kinds))
 
 
@@ -393,8 +394,9 @@ def _constrained_sky(definition: tuple[Any, ...], observed: bytes, seed: int, re
 
 
 @lru_cache(maxsize=2)
-def _survey(simulated: str, kinds: Kinds, content: str) -> Survey:
+def _survey(simulated: str, kinds: Kinds, fiducial: str, content: str) -> Survey:
     """Keep the last surveys: jobs of a run follow each other, and a gain drift takes a pass over the pointing."""
+    check_files(fiducial, content)
     return survey(config.from_json(simulated), library=dict(kinds))
 
 
@@ -402,4 +404,14 @@ def _survey(simulated: str, kinds: Kinds, content: str) -> Survey:
 def _analysis(
     fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings, kinds: Kinds, content: str
 ) -> Analysis:
+    check_files(fiducial, content)
     return analysis_of(config.from_json(fiducial), without, settings=settings, library=dict(kinds))
+
+
+def check_files(run: str, content: str) -> None:
+    """Raise RunError if ``content``, the hash of a run (JSON) and of its files, is that of others; "": not known."""
+    if content and config.digest(config.from_json(run)) != content:
+        raise RunError(
+            "The files that the run names have changed since it was read, or a worker sees others; let workers share "
+            "them, leave them as they are, and run the same command again."
+        )

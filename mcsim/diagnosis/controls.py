@@ -17,7 +17,7 @@ import numpy as np
 
 from mcsim import config
 from mcsim.config.noise import AnyNoise
-from mcsim.datavector.analysis import Analysis, Kinds
+from mcsim.datavector.analysis import Analysis, Kinds, check_files
 from mcsim.datavector.campaign import Batch, asking, seeded
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.control_result import Control, Controls
@@ -153,6 +153,7 @@ def draw(run: str, content: str, library: Kinds, sample_by_sample: bool, realiza
 @lru_cache(maxsize=1)
 def _survey(run: str, content: str, library: Kinds) -> DisturbedSurvey:
     """Keep the survey of the last controls; each draws its own nuisances."""
+    check_files(run, content)
     return DisturbedSurvey.of(config.from_json(run), dict(library))
 
 

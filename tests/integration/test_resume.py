@@ -9,11 +9,14 @@ import pytest
 import mcsim
 from mcsim import config
 from mcsim.datavector import campaign
+from mcsim.datavector.analysis import analysis_for, data_vectors
 from mcsim.datavector.kept import Kept
 from mcsim.diagnosis import api, words
+from mcsim.errors import RunError
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.support.npy import write_npy
+from refusals import refused
 
 MODEL = {
     "schema": 1,
@@ -193,6 +196,28 @@ def test_who_learns_a_model_ends_no_other_diagnosis_of_it(tmp_path, monkeypatch,
     monkeypatch.undo()
     parts.keep(job, np.ones((2, 3)))
     assert len(parts.found(job)) == 2
+
+
+@pytest.mark.parametrize("nuisances", [False, True])
+def test_simulations_with_files_that_have_changed_are_refused(tmp_path, nuisances):
+    """Each worker reads the files itself: four times the power of the sky was kept as simulations of the model."""
+    ell = np.arange(25.0)
+    table = np.stack([ell, 1000.0 / (ell + 1.0) ** 2], axis=1)
+    np.savetxt(tmp_path / "cl.txt", table)
+    prior = [{"effect": "beam_width", "channel": "V", "width": 0.01}]
+    plain = MODEL | {"sky": MODEL["sky"] | {"spectrum": str(tmp_path / "cl.txt")}, "nuisance": prior}
+    analysis = api.analysis_of(config.load(plain), library=LIBRARY)
+    job = replace(analysis.job(analysis.run), count=1, nuisances=nuisances)
+    np.savetxt(tmp_path / "cl.txt", table * [1, 4])
+    with refused(by=RunError):
+        analysis_for(job)
+    np.savetxt(tmp_path / "cl.txt", table)
+    assert analysis_for(job).elements == analysis.elements
+    np.savetxt(tmp_path / "cl.txt", table * [1, 4])
+    with refused(by=RunError):
+        data_vectors(job)
+    np.savetxt(tmp_path / "cl.txt", table)
+    assert len(data_vectors(job)) == 1
 
 
 def test_what_takes_long_is_kept_in_small_pieces(tmp_path):
