@@ -22,6 +22,9 @@ from mcsim.support.arrays import divided
 
 MONOPOLE = Mode(0, 0, 0)
 
+BESIDE = 24
+"""Degrees beyond the width of a bin up to which weights are taken to correlate it with others."""
+
 
 def cl_of(survey: Survey, monopole: NDArray[np.complex128]) -> NDArray[np.float64]:
     """Return C_l of A^{00}_ll."""
@@ -74,17 +77,17 @@ def scattered(survey: Survey, found: dict[tuple[int, int], Means], number: int) 
 def variances_of(
     survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[int, int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return E|A - mean|^2 of an isotropic sky, shape (mode, lmax + 1), and that of binned spectra, (mode, bin)."""
+    """Return variances for an isotropic sky, shape (mode, lmax + 1), and the covariance of bins, (mode, bin, bin)."""
     layout = plan.layout(survey)
     spectra = _spectra(survey, found, pair)
-    reach = min(layout.bin_width - 1, survey.lmax)
+    reach = min(layout.bin_width - 1 + BESIDE, survey.lmax)
     weights = _overlap(survey, pair, reach)
     absent = np.isnan(found[pair].beam)
     shifted = [
         np.where(absent, np.nan, isotropic_variance(survey.estimator.modes, spectra, weights, shift))
         for shift in range(len(weights.autos))
     ]
-    return shifted[0], summary.binned_variance(layout, shifted)
+    return shifted[0], summary.binned_covariance(layout, shifted)
 
 
 def _spectra(survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[int, int], share: float = 1.0) -> Spectra:

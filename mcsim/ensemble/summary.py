@@ -36,22 +36,27 @@ def binned(layout: Layout, values: NDArray) -> NDArray:
     return divided(total, count, np.nan)
 
 
-def binned_variance(layout: Layout, shifted: Sequence[NDArray]) -> NDArray:
-    """Return the variance of :func:`binned`, shape (..., mode, bin).
+def binned_covariance(layout: Layout, shifted: Sequence[NDArray]) -> NDArray:
+    """Return the covariance of :func:`binned` between bins, shape (..., mode, bin, bin), NaN where one is empty.
 
     ``shifted`` are the variances of coefficients, and their covariances with those n = 1, 2, ... degrees above, up to
     the sign that the factors take out; each of shape (..., mode, lmax + 1).
     """
     size = np.abs(_factors(layout.modes, layout.lmax))
     place = np.arange(layout.lmax + 1) // layout.bin_width
-    total, count = _sums(layout, size**2 * shifted[0])
-    for n, covariance in enumerate(shifted[1:], 1):
-        together = place[:-n] == place[n:]
-        products = np.where(together, size[..., :-n] * size[..., n:] * covariance[..., :-n], 0.0)
-        padded = np.concatenate([products, np.zeros((*products.shape[:-1], n))], axis=-1)
-        total = total + 2.0 * _sums(layout, padded)[0]
+    count = _sums(layout, size * shifted[0])[1]
+    total = np.zeros(2 * count.shape[-1:] + count.shape[:-1])
+    for n, covariance in enumerate(shifted):
+        lower, upper = slice(None, layout.lmax + 1 - n), slice(n, None)
+        products = np.nan_to_num(size[..., lower] * size[..., upper] * covariance[..., lower])
+        np.add.at(total, (place[lower], place[upper]), np.moveaxis(products, -1, 0))
+        if n:
+            np.add.at(total, (place[upper], place[lower]), np.moveaxis(products, -1, 0))
     # Of maps without noise and odd L only round-off of either sign remains.
-    return divided(np.maximum(total, 0.0), count**2, np.nan)
+    each = np.arange(count.shape[-1])
+    total[each, each] = np.maximum(total[each, each], 0.0)
+    found = np.moveaxis(total, (0, 1), (-2, -1))
+    return divided(found, count[..., :, None] * count[..., None, :], np.nan)
 
 
 def _sums(layout: Layout, values: NDArray) -> tuple[NDArray, NDArray]:

@@ -110,7 +110,7 @@ def test_equal_weights_share_all_and_those_of_all_sky_are_one() -> None:
     assert every[0] + 2.0 * every[1:].sum() == pytest.approx(np.mean(weight**4), rel=1e-3)
 
 
-def test_variance_of_a_bin_is_that_of_the_sum_of_its_coefficients() -> None:
+def test_covariance_of_bins_is_that_of_the_sums_of_their_coefficients() -> None:
     """Coefficients whose sign alternates as those of A^{LM} do, and which correlate up to two degrees apart."""
     modes, lmax = all_modes(1, both_orders=False), 11
     layout = Layout(1, 1, ("A",), ("A,A",), modes, lmax, False, None, frame="ecliptic", bin_width=5, filtered=False)
@@ -119,10 +119,9 @@ def test_variance_of_a_bin_is_that_of_the_sum_of_its_coefficients() -> None:
     covariance = mixing @ mixing.T
     weights = summary.binned(layout, np.broadcast_to(np.eye(lmax + 1)[:, None], (lmax + 1, len(modes), lmax + 1)))
     for row in range(len(modes)):
-        used = np.moveaxis(weights, 0, -1)[row]
-        shifted = np.full((5, len(modes), lmax + 1), np.nan)
-        for n in range(5):
+        used = np.abs(np.moveaxis(weights, 0, -1)[row])
+        shifted = np.full((8, len(modes), lmax + 1), np.nan)
+        for n in range(8):
             shifted[n, row, : lmax + 1 - n] = np.diag(covariance, n)
-        found = summary.binned_variance(layout, list(shifted))[row]
-        expected = np.einsum("bi,ij,bj->b", np.abs(used), covariance, np.abs(used))
-        np.testing.assert_allclose(found, expected, rtol=1e-12)
+        found = summary.binned_covariance(layout, list(shifted))[row]
+        np.testing.assert_allclose(found, used @ covariance @ used.T, rtol=1e-12)
