@@ -54,7 +54,7 @@ def responses(run: config.RunConfig, file: str, call: Batch) -> dict[str, list[O
     quiet = replace(run.unfiltered(), channels=tuple(channel.without_noise() for channel in run.channels))
     runs = [with_effects(quiet, [*idle, *more]) for more in ((), *([one] for one in added))]
     jobs = [
-        (Job(config.to_json(run), config.to_json(one), 0, SKIES, True, content=config.digest(run)), file)
+        (Job(config.to_json(run), config.to_json(one), 0, SKIES, True, content=config.digest(run, "nuisance")), file)
         for one in runs
     ]
     simulated = dict(call(_data_vectors, jobs))

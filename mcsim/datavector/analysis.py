@@ -409,8 +409,8 @@ def _analysis(
 
 
 def check_files(run: str, content: str) -> None:
-    """Raise RunError if ``content``, the hash of a run (JSON) and of its files, is that of others; "": not known."""
-    if content and config.digest(config.from_json(run)) != content:
+    """Raise RunError if the files of a run (JSON) are not those of ``content``, as of an analysis; "": not known."""
+    if content and config.digest(config.from_json(run), "nuisance") != content:
         raise RunError(
             "The files that the run names have changed since it was read, or a worker sees others; let workers share "
             "them, leave them as they are, and run the same command again."

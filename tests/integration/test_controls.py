@@ -178,7 +178,7 @@ def test_a_file_that_has_changed_is_read_again(tmp_path):
     for factor in (1.0, 4.0):
         np.savetxt(tmp_path / "cl.txt", np.stack([ell, factor * 1e3 / (ell * (ell + 1))], axis=1))
         folder = tmp_path / f"{factor:g}"
-        controls.draw(config.to_json(run), config.digest(run), kinds_of(None), False, 0, str(folder))
+        controls.draw(config.to_json(run), config.digest(run, "nuisance"), kinds_of(None), False, 0, str(folder))
         rms.append(np.std(np.load(folder / "maps.npy")))
     assert rms[1] == pytest.approx(2.0 * rms[0], rel=1e-9)
 
