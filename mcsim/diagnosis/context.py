@@ -93,7 +93,8 @@ def calibration_of(ensemble: NullEnsemble, null: SimulatedGaussian, groups: Whit
     """
     found = calibrate(null, groups)
     if ensemble.nuisances is not None:
-        return calibrate_on(found, null, groups, ensemble.simulations)
+        single = replace(null, scale_variance=ensemble.skies * null.scale_variance)  # of one sky, as simulations are
+        return calibrate_on(found, single, groups, ensemble.simulations)
     return calibrate_in_folds(found, null, groups) if null.folds else found
 
 

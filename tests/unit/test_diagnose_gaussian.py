@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from mcsim.datavector.null_ensemble import NullEnsemble
+from mcsim.datavector.summaries import Element
+from mcsim.diagnosis.context import calibration_of
 from mcsim.stats.gaussian import SimulatedGaussian, nested_pvalue, residual_pvalue
 from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_in_folds, global_test, scan_pvalues
 from refusals import refused
@@ -207,3 +210,23 @@ def test_candidates_that_data_do_not_respond_to_raise_no_alarm(shrink):
     p = [global_test(null, rng.normal(size=10), groups, calibration) for _ in range(300)]
     assert all(one.maximum == 1.0 for one in p)
     assert stats.kstest([one.pvalue for one in p], "uniform").pvalue > 1e-3
+
+
+def test_calibration_with_nuisances_is_the_same_for_the_mean_of_any_number_of_skies():
+    """Simulations, of one sky each, scatter in scale as one does: those for 16 had p below 0.05 in 8.5 of 100 cases."""
+    rng = np.random.default_rng(2)
+    count, p = 400, 6
+    x = rng.normal(size=(count, p)) * np.exp(0.3 * rng.normal(size=(count, 1)))
+    x -= x.mean(axis=0)
+    drawn = rng.normal(size=(count, 1))
+    drawn -= drawn.mean(axis=0)
+    drawn -= x @ np.linalg.lstsq(x, drawn, rcond=None)[0]  # of which the data vector depends on nothing
+    elements = tuple(Element(str(k), "map", ("A",)) for k in range(p))
+    one = NullEnsemble(x, np.zeros(p), elements, x[:0], *[np.zeros((0, 0))] * 4, nuisances=drawn)
+    found = []
+    for ensemble in (one, one.of_mean(16)):
+        null = ensemble.gaussian
+        groups = null.whiten_groups(np.eye(p)[:, :2], [[0], [1]])
+        found.append(calibration_of(ensemble, null, groups).held_out_combined)
+    assert null.scale_variance > 0.02
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
