@@ -126,7 +126,7 @@ def refuse_external(run: config.RunConfig) -> None:
         given = run.simulator or run.ensemble.maps
         raise InputError(
             f"{run.name} has {key} = {given!r}, which only a diagnosis or a comparison of maps takes; remove it to "
-            "simulate with mcsim."
+            "simulate with mcsim, or take coefficients of its maps with mcsim.biposh (docs/howto/simulator.md)."
         )
 
 

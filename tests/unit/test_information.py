@@ -424,7 +424,7 @@ def test_noise_that_is_not_white_is_refused() -> None:
     ],
 )
 def test_maps_of_another_program_have_no_limit(key, given) -> None:
-    with refused(key):
+    with refused(key, "mcsim.biposh"):
         mcsim.limit(model(**given))
 
 
