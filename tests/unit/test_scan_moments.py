@@ -299,7 +299,7 @@ def header(key, value):
         (put("HITS", -1.0), {}, ("HITS", -1, "pixel 5")),
         (put("RE_1", 1.5), {}, ("modulus", 1.50333)),
         (header("ORDERING", "NESTED"), {}, ("ORDERING", "NESTED", "RING")),
-        (header("ORDERING", None), {}, ("ORDERING", "None", "RING")),
+        (header("ORDERING", None), {}, ("no ORDERING", "write RING")),
         (header("COORDSYS", None), {}, ("COORDSYS",)),
         (header("COORDSYS", "X"), {}, ("COORDSYS", "X")),
         (header("NSIDE", 32), {}, ("NSIDE", 32, "3072 pixels")),

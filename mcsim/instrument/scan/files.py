@@ -66,6 +66,8 @@ def _from_fits(path: str | Path, where: str, smax: int | None, frame: str | None
     nside = nside_of(hits.size, where)
     if header["NSIDE"] not in (None, nside):
         raise InputError(f"{where} says NSIDE = {header['NSIDE']} but has {hits.size} pixels; write it again.")
+    if header["ORDERING"] is None:
+        raise InputError(f"{where} has no ORDERING; write RING there if its pixels are so, or reorder it first.")
     if str(header["ORDERING"]).strip().upper() != "RING":
         raise InputError(f"{where} has ORDERING = {header['ORDERING']!r}, but it must be RING; reorder it first.")
     stated = frame_named(header["COORDSYS"], where) or frame
