@@ -199,7 +199,7 @@ def _warn_of_orders(run: config.RunConfig, spec: config.Channel, beam: beams.Bea
     if not isinstance(spec.scan, config.ScanMoments) or beam.mmax <= fiducial.mmax:
         return
     paths = [config.channel_path(spec.scan.path, spec.name, split) for split in run.map.each_split]
-    smax = min(scan.read_moments(path).smax for path in paths)
+    smax = min(scan.read_moments(path, frame=run.map.frame).smax for path in paths)
     refuse_short(spec.name, smax, fiducial)
     change = beam.blm.copy()
     change[: fiducial.mmax + 1] -= fiducial.blm
@@ -280,7 +280,7 @@ def known_offsets(run: config.RunConfig, spec: config.Channel) -> int:
     match spec.scan:
         case config.ScanMoments():
             paths = [config.channel_path(spec.scan.path, spec.name, split) for split in run.map.each_split]
-            return min(scan.read_moments(path).offset_order for path in paths)
+            return min(scan.read_moments(path, frame=run.map.frame).offset_order for path in paths)
         case config.ScanDifferencing():
             return 1
     return HIGHEST

@@ -17,7 +17,7 @@ from mcsim.beamfit.effective_beam import fit_models
 from mcsim.ensemble.maps import write_maps
 from mcsim.errors import InputError
 from mcsim.instrument.scan import write_moments_fits
-from mcsim.simulation.channels import check_effects
+from mcsim.simulation.channels import check_effects, known_offsets
 from mcsim.simulation.nuisance import check_nuisances
 from mcsim.simulation.survey import survey
 from refusals import refused
@@ -271,6 +271,19 @@ def test_orders_that_a_file_of_moments_lacks_are_warned_of(smax, warned, tmp_pat
         warnings.simplefilter("always")
         check_effects(mcsim.load_config(run(effect=[coma], channel=[channel])))
     assert [f"end at s = {smax}, which leaves out 10 %" in str(one.message) for one in told] == [True] * warned
+
+
+def test_a_file_of_moments_that_names_no_frame_has_that_of_the_maps_beside_effects(tmp_path: Path) -> None:
+    """A run took it, and refused it with an effect that gives the beam more orders; so did a comparison."""
+    path = tmp_path / "moments.fits"
+    write_moments_fits(path, Moments.parallel_transport(nside=NSIDE, smax=4))
+    fits.delval(path, "COORDSYS", ext=1)
+    ellipse = {"name": "beam_ellipticity", "channel": "W", "amplitude": 0.1}
+    model = mcsim.load_config(
+        run(effect=[ellipse], channel=[CHANNEL | {"scan": {"kind": "moments", "path": str(path)}}])
+    )
+    check_effects(model)
+    assert known_offsets(model, model.channels[0]) == 0
 
 
 def test_a_file_of_moments_without_the_orders_of_the_beam_is_refused_whatever_effects_add(tmp_path: Path) -> None:
