@@ -75,7 +75,7 @@ def maps(
     """
     short = _side_b(channel).iterations_short > 0
     whole = _side_maps(channel, sky, nthreads)
-    circular = whole[0][:, :1], whole[1][:, :1]
+    circular = _circular(whole)
     start = None if short else _mean(circular)
     for m, (control, complete) in _rhs(channel, [circular, whole], dipole, (seed, realization), nthreads):
         smooth = _solve(m, channel, control, start, "the circular-beam control", nthreads)
@@ -150,6 +150,11 @@ def _side_maps(channel: Channel, sky: NDArray[np.complex128], nthreads: int) -> 
     )
 
 
+def _circular(sides: Sides) -> Sides:
+    """Return what the circular parts of both beams see."""
+    return sides[0][:, :1], sides[1][:, :1]
+
+
 def _mean(sides: Sides) -> Map:
     """Return the mean of what the circular parts of both beams see."""
     return np.asarray(0.5 * (sides[0][:, 0] + sides[1][:, 0]))
@@ -162,7 +167,10 @@ def _rhs(
     draw: tuple[int, int],
     nthreads: int,
 ) -> Iterator[tuple[SurveyMap, NDArray[np.float64]]]:
-    """Yield every map with its right-hand sides, shape (skies, npix); ``draw`` has seed and realization."""
+    """Yield every map with its right-hand sides, shape (skies, npix); ``draw`` has seed and realization.
+
+    ``skies``: through the whole beams, and before that, if at all, through their circular parts.
+    """
     side_b, nside = _side_b(channel), channel.site.nside
     x = side_b.scan.transmission_imbalance
     removed = None
@@ -171,7 +179,7 @@ def _rhs(
             convolve.response(b, channel.site.lmax, channel.seen_window) for b in (channel.site.beam, side_b.fiducial)
         ]
         dipole_a, dipole_b = (mapmaking.side_maps(dipole, response, nside, nthreads) for response in fiducial)
-        removed = [(dipole_a, dipole_b)]
+        removed = [_circular((dipole_a, dipole_b)), (dipole_a, dipole_b)][-len(skies) :]
     for m in channel.maps:
         generator = rng.generator(*draw, f"noise/{m.name}")
         noise = mapmaking.DifferenceNoise(side_b.sigma0_uk, generator, side_b.noise_factor)

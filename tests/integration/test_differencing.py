@@ -129,6 +129,17 @@ def gaussian_window(fwhm_arcmin: float) -> np.ndarray:
     return np.exp(-0.5 * ell * (ell + 1) * sigma**2)
 
 
+def test_a_dipole_leaves_the_control_as_the_circular_parts_see_it(year):
+    """An effect that does nothing adds it to the sky and takes it off again, of each part what that part sees."""
+    blm = mcsim.Beam.elliptical(300.0, 250.0, lmax=LMAX).blm.copy()
+    blm[1, 1:] = 0.1 * blm[0, 1:]
+    lopsided, sky = mcsim.Beam.from_blm(blm), {"spectrum": "wmap7", "lmax": LMAX, "dipole_uk": 3364.5}
+    idle = {"name": "calibration", "channel": "W1", "amplitude": 0.0}
+    found, wanted = (realize(year(channel={"beam": lopsided}, sky=sky, effect=one)) for one in ([idle], []))
+    for name, values in wanted.items():  # the residual of a map-making is 1e-8
+        np.testing.assert_allclose(found[name], values, rtol=0.0, atol=1e-6 * np.nanmax(abs(values)))
+
+
 def test_opposite_beams_cancel_what_equal_ones_show(year):
     """Side B's ellipse across side A's: the mean of the two b_l2 vanishes, and with it A^{20}."""
     along = LONG | {"angle_deg": 0.0}
