@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError, RunError
 from mcsim.support import folders, resources
 from mcsim.support.arrays import numbers
+from mcsim.support.loading import once_per_content
 from mcsim.support.npy import write_npy
 
 
@@ -128,6 +129,7 @@ def kept(write: Callable[[Path], Any], what: str) -> Path:
         ) from None
 
 
+@once_per_content(maxsize=256)
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal."""
     with path.open("rb") as stream:
