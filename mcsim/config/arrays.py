@@ -112,7 +112,7 @@ def kept(write: Callable[[Path], Any], what: str) -> Path:
     root = folders.default_cache_dir()
     try:
         root.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".given.", dir=root) as scratch:
+        with tempfile.TemporaryDirectory(prefix=folders.scratch_prefix("given"), dir=root) as scratch:
             write(Path(scratch))
             contents = "\n".join(f"{sha256_of(path)} {path.name}" for path in sorted(Path(scratch).iterdir()))
 

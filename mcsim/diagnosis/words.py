@@ -247,8 +247,8 @@ def summary(result: DiagnosisResult, folder: Path) -> list[str]:
     rows += [("detected", _numbered(result.partial))] if result.partial else []
     if result.sets:
         if tests := [one.pvalue for effect in result.effects for one in effect.consistency]:
-            least = p_equals(min(tests))
-            rows.append(("parts agree", f"{len(tests)} comparisons of amplitudes, the least likely {least}"))
+            counted = "one comparison" if len(tests) == 1 else f"the least likely of {len(tests)} comparisons"
+            rows.append(("parts agree", f"{counted} of amplitudes has {p_equals(min(tests))}"))
         rows.append(("held-out data", held_out(result)))
     if result.kind != "none":
         first = result.places[0]

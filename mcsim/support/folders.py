@@ -36,6 +36,11 @@ def real_path(path: Path) -> Path:
     return Path(os.path.realpath(path)) if os.path.islink(path) else path
 
 
+def scratch_prefix(name: str) -> str:
+    """Return how the name of a scratch folder begins: if this process is killed, :func:`appearing` deletes it later."""
+    return f".{name}.{socket.gethostname()}.{os.getpid()}."
+
+
 @contextmanager
 def appearing(path: Path) -> Iterator[Path]:
     """Yield a scratch folder beside ``path``; rename it to ``path`` at the end, delete it if the block fails.
@@ -51,7 +56,7 @@ def appearing(path: Path) -> Iterator[Path]:
         number = left.name.rpartition(host)[2].partition(".")[0]
         if number.isdecimal() and not alive(int(number)):
             shutil.rmtree(left, ignore_errors=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}{host}{os.getpid()}.", dir=path.parent))
+    scratch = Path(tempfile.mkdtemp(prefix=scratch_prefix(path.name), dir=path.parent))
     try:
         yield scratch
         scratch.chmod(0o755)  # a temporary folder is readable by its owner alone

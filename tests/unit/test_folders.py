@@ -42,17 +42,23 @@ def test_who_was_quicker_stays(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
 
 
-def test_what_a_killed_process_has_left_is_deleted(tmp_path):
+@pytest.mark.parametrize(
+    "made",
+    ["with folders.appearing(folders.default_cache_dir() / 'one') as path: stop(path)", "arrays.kept(stop, 'map')"],
+)
+def test_what_a_killed_process_has_left_is_deleted(made, tmp_path):
     """Each killed diagnosis left a folder, pairs of a differencing scan 8 bytes for each sample."""
     code = f"""
 import os, signal
-from pathlib import Path
-from mcsim.support.folders import appearing
-with appearing(Path({str(tmp_path / "one")!r})) as scratch:
-    (scratch / "file").write_text("half")
+from mcsim.config import arrays
+from mcsim.support import folders
+def stop(folder):
+    (folder / "file").write_text("half")
     os.kill(os.getpid(), signal.SIGKILL)
+{made}
 """
-    assert subprocess.run([sys.executable, "-c", code]).returncode == -signal.SIGKILL
+    environment = os.environ | {"MCSIM_CACHE": str(tmp_path)}
+    assert subprocess.run([sys.executable, "-c", code], env=environment).returncode == -signal.SIGKILL
     (left,) = tmp_path.iterdir()
     other = left.with_name(left.name.replace(socket.gethostname(), "elsewhere"))  # where it may be alive
     other.mkdir()
