@@ -94,8 +94,8 @@ class NoiseKnee(Effect):
     unit = "fraction of f_knee"
     wording = Wording("{} higher knee", " %", 100.0, negative="{} lower knee")
     cause = "Amplifiers, thermal control or an atmosphere that drift more than the noise model says."
-    signature = "Autos only, along the scan, most at the largest scales; destriped, nearly as noise_level."
-    source = "Planck 2013 results III, A&A 571, A3 (knee frequencies of LFI); Keihanen et al. 2004, A&A 428, 287"
+    signature = "Autos only, along the scan, most at the largest scales, or as noise_level; acts on 1/f noise only."
+    source = "Planck early results V, A&A 536, A5 (knee frequencies of LFI); Keihanen et al. 2004, A&A 428, 287"
     step = 0.05
     bounds = (Bound("amplitude", -1.0, 3.0, "a prior of this library: knees are known to a factor of four"),)
     parametrization = Parametrization(noise_alone=True, matched_filter=False)
