@@ -71,7 +71,7 @@ def _check_size(run: config.RunConfig, map_: Map, name: str) -> None:
 def given_maps(run: config.RunConfig, data: str | Path | Sequence[Map] | Mapping[str, Map]) -> dict[str, Map]:
     """Return the maps of a folder, or given ones, in the order of the run's, uK, by the names of messages.
 
-    InputError is raised for what :func:`read_maps` and :func:`checked` refuse without a model, which may take minutes.
+    InputError is raised for what :func:`read_maps` refuses without a model, which may take minutes.
     """
     return _read(run, data) if isinstance(data, str | Path) else _taken(run, data)
 
@@ -84,16 +84,17 @@ def checked_maps(model: Model, given: Mapping[str, Map]) -> list[Map]:
     return maps
 
 
-def read_maps(model: Model, folder: str | Path) -> list[Map]:
+def read_maps(model: Model, data: str | Path | Sequence[Map] | Mapping[str, Map]) -> list[Map]:
     """Read the maps of every channel and split, in the order of the model's, uK.
 
-    The folder has ``{channel}.fits``, or ``{channel}_{split}.fits`` where the model has splits: HEALPix in uK (or the
-    unit of its header), ``healpy.UNSEEN`` if not observed, in RING order or with a header that says another. InputError
-    is raised if a file is missing or unreadable, has another nside, frame or unit, or values that are no map of this
-    survey: not finite, constant, without what the fiducial scan hits, or far from the size of the model. Other FITS
-    files are not read, which a warning says.
+    A folder has ``{channel}.fits``, or ``{channel}_{split}.fits`` where the model has splits: HEALPix in uK (or the
+    unit of its header), ``healpy.UNSEEN`` if not observed, in RING order or with a header that says another. Given maps
+    are in uK, or as their attributes say, by name or in the order of the model's. InputError is raised if one is
+    missing or unreadable, has another nside, frame or unit, or values that are no map of this survey: not finite,
+    constant, without what the fiducial scan hits, or far from the size of the model. Others are not read, which a
+    warning says.
     """
-    return checked_maps(model, _read(model.survey.config, folder))
+    return checked_maps(model, given_maps(model.survey.config, data))
 
 
 def of_pixel_means(model: Model, folder: str | Path) -> bool:
@@ -105,14 +106,6 @@ def of_pixel_means(model: Model, folder: str | Path) -> bool:
             if first_table(hdus).header.get(name) != wanted:
                 return False
     return True
-
-
-def checked(model: Model, maps: Sequence[Map] | Mapping[str, Map]) -> list[Map]:
-    """Check given maps, by name or in the order of the model's, like those of a folder; uK, or as their attributes say.
-
-    InputError as well for attributes ``frame`` or ``ordering`` that are not the model's and RING.
-    """
-    return checked_maps(model, _taken(model.survey.config, maps))
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -134,11 +134,10 @@ def test_pairs_are_computed_once(tmp_path, monkeypatch):
     assert len(list(tmp_path.iterdir())) == 4
 
 
-def test_damaged_pairs_are_refused(tmp_path):
-    mapmaking.prepare(MODEL, "D", SHORT, cache_dir=tmp_path)
+def test_damaged_pairs_are_made_again(tmp_path):
+    first = np.array(mapmaking.prepare(MODEL, "D", SHORT, cache_dir=tmp_path).partner)
     next(tmp_path.glob("*/partner.raw")).write_bytes(b"")
-    with refused(next(tmp_path.iterdir())):
-        mapmaking.prepare(MODEL, "D", SHORT, cache_dir=tmp_path)
+    np.testing.assert_array_equal(mapmaking.prepare(MODEL, "D", SHORT, cache_dir=tmp_path).partner, first)
 
 
 @pytest.mark.parametrize("x", [0.0, 0.02])
