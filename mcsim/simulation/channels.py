@@ -16,6 +16,7 @@ from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
 from mcsim.instrument.beams.coefficients import power_by_order
 from mcsim.instrument.scan.offsets import HIGHEST
+from mcsim.simulation.timestream import nyquist_hz
 from mcsim.sphere import rotation
 from mcsim.support import resources
 
@@ -186,6 +187,17 @@ def _refuse_noise(run: config.RunConfig, spec: config.Channel, acting: tuple[sys
                 f"effect {effect.name} on channel {spec.name} moves the knee of noise with memory, but the channel's "
                 'noise has none; remove it, or give the channel noise of kind "correlated".'
             )
+    for split, noise in zip(run.map.each_split, given, strict=True):
+        if isinstance(noise, NoiseCorrelated) and isinstance(spec.scan, config.ScanHitAveraged):
+            knee, model = noise.f_knee_hz, scan_model(spec, spec.scan, split)
+            for effect in acting:
+                knee = effect.knee(knee)
+            if knee != noise.f_knee_hz and knee >= (nyquist := nyquist_hz(model)):
+                raise InputError(
+                    f"effects move the knee of the noise of channel {spec.name} to {knee:g} Hz, which is not below "
+                    f"{nyquist:g} Hz, half the sampling rate of {model.name!r}; lower their amplitude or shorten "
+                    "scan.sample_period_s."
+                )
     for effect in acting if all(is_noise_free(one) for one in given) else ():
         if effect.amplitude != 0.0 and effect.parametrization.noise_alone:
             raise InputError(

@@ -90,18 +90,13 @@ class CorrelatedNoise:
         return self._drawn(seed, realization, self.streams)
 
     def with_knee(self, f_knee_hz: float) -> Self:
-        """Return the noise with another knee, of the same random numbers; at f_min or below it is white.
+        """Return the noise with another knee, of the same random numbers: at f_min or below it is white.
 
-        InputError if the sampling cannot show the knee.
+        A knee that the sampling cannot show is the highest one that it can: a diagnosis tries them.
         """
-        nyquist = min(_nyquist_hz(self.model, line) for line in self.model.select())
-        if f_knee_hz >= nyquist:
-            raise InputError(
-                f"effects move the knee of the noise to {f_knee_hz:g} Hz, which is not below {nyquist:g} Hz, half the "
-                f"sampling rate of {self.model.name!r}; lower their amplitude or shorten scan.sample_period_s."
-            )
         least = math.nextafter(self.noise.f_min_hz, math.inf)
-        return replace(self, noise=replace(self.noise, f_knee_hz=max(f_knee_hz, least)))
+        most = math.nextafter(nyquist_hz(self.model), 0.0)
+        return replace(self, noise=replace(self.noise, f_knee_hz=min(max(f_knee_hz, least), most)))
 
     def _drawn(self, seed: int, realization: int, streams: str) -> Map:
         in_pixels, in_baselines = np.zeros(self.grid.npix), np.zeros(0 if self.pairs is None else self.pairs.shape[0])
@@ -196,13 +191,12 @@ def _fill(folder: Path, empty: CorrelatedNoise) -> None:
 
 
 def _check(noise: NoiseCorrelated, model: ScanModel) -> None:
+    if noise.f_knee_hz >= (nyquist := nyquist_hz(model)):
+        raise InputError(
+            f"noise.f_knee_hz = {noise.f_knee_hz:g} is not below {nyquist:g} Hz, half the sampling rate of "
+            f"{model.name!r}; lower it or shorten scan.sample_period_s."
+        )
     for line in model.select():
-        nyquist = _nyquist_hz(model, line)
-        if noise.f_knee_hz >= nyquist:
-            raise InputError(
-                f"noise.f_knee_hz = {noise.f_knee_hz:g} is not below {nyquist:g} Hz, half the sampling rate of "
-                f"{model.name!r}; lower it or shorten scan.sample_period_s."
-            )
         shortest = 1.0 / (model.samples(line) * model.period_of_samples(line))
         if noise.f_min_hz < shortest:
             raise InputError(
@@ -211,8 +205,9 @@ def _check(noise: NoiseCorrelated, model: ScanModel) -> None:
             )
 
 
-def _nyquist_hz(model: ScanModel, line: LineOfSight) -> float:
-    return 0.5 / model.period_of_samples(line)
+def nyquist_hz(model: ScanModel) -> float:
+    """Return half the lowest sampling rate of a model's lines of sight."""
+    return 0.5 / max(model.period_of_samples(line) for line in model.select())
 
 
 def _timed(

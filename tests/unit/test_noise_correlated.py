@@ -223,7 +223,13 @@ def test_a_knee_that_no_noise_has_is_refused(noise, amplitude, named):
 
 def test_a_knee_beyond_what_the_sampling_shows_is_refused():
     with refused(1.5e-3, 0.5 / PERIOD_S, "scan.sample_period_s"):
-        survey(run_with(effect=[{"name": "noise_knee", "channel": "W", "amplitude": 2.0}]))
+        check_effects(run_with(effect=[{"name": "noise_knee", "channel": "W", "amplitude": 2.0}]))
+
+
+def test_a_diagnosis_may_try_a_knee_beyond_what_the_sampling_shows():
+    made = short(NOISE)[0]
+    assert made.with_knee(1.0).noise.f_knee_hz == pytest.approx(0.5 / PERIOD_S)
+    assert np.isfinite(made.with_knee(1.0).draw(3, 0)).all()
 
 
 def test_a_survey_that_spins_backwards_has_noise():
