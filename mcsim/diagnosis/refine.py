@@ -327,21 +327,28 @@ class Refiner:
         for index, single in enumerate(found.singles):
             if candidates[index].nuisance:
                 work.setdefault(index, (index, single.amplitudes, single.covariance))
-        if found.explanations and len(found.explanations[0].members) == 1:
-            return list(work.values())
         # Single ones too: a strong effect has a nonlinear response, and a stochastic one scatters it, until only a
-        # mixture seems to be sufficient.
+        # mixture seems to be sufficient. Where a single one is, the stochastic ones that may be as well.
+        alone = bool(found.explanations) and len(found.explanations[0].members) == 1
+        tried = 0 if alone else self.context.settings.tried
         ranked = [int(index) for index in np.argsort([-single.delta_chi2 for single in found.singles])]
         stochastic = {candidates[index].identity for index in work if candidates[index].parametrization.stochastic}
         for place, index in enumerate(ranked):
             single, candidate = found.singles[index], candidates[index]
             pvalue = float(self.context.calibration.global_pvalue(single.nested_pvalue))
             detected = candidate.parametrization.stochastic and pvalue <= self.context.settings.stochastic_level
-            if place < self.context.settings.tried or (detected and candidate.identity not in stochastic):
+            detected = detected and (not alone or self._may_suffice(candidate, single))
+            if place < tried or (detected and candidate.identity not in stochastic):
                 work.setdefault(index, (index, single.amplitudes, single.covariance))
                 if candidate.parametrization.stochastic:
                     stochastic.add(candidate.identity)
         return list(work.values())
+
+    def _may_suffice(self, candidate: Candidate, alone: Fit) -> bool:
+        """Return True if what a candidate leaves of the data can be an error of its templates, those of other skies."""
+        wrong = 0.0 if candidate.shape_error is None else candidate.shape_error**2 * alone.delta_chi2
+        pvalue = self.context.null.residual_test(alone.chi2, len(candidate.columns), wrong)
+        return bool(pvalue > self.context.settings.residual_level)
 
     def _is_beyond_prior(self, t: Matrix, candidates: int) -> bool:
         """Return True if data depart along the templates of a nuisance, shape (p, k), by more than its prior explains.

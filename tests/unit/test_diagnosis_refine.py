@@ -212,6 +212,27 @@ def test_half_of_an_effect_that_cannot_be_whole_is_as_significant(monkeypatch):
     assert [amplitudes["A"] for amplitudes in instrument.analysis] == pytest.approx([6.0], abs=0.1)
 
 
+@pytest.mark.parametrize(("snr", "error", "members"), [(8.0, 0.85, {(0,), (2,)}), (12.0, 0.01, {(2,)})])
+def test_a_stochastic_effect_that_may_suffice_is_simulated_beside_a_single_one(monkeypatch, snr, error, members):
+    """C leaves 0.3 of the S/N of what A has drawn for this very sky, which is far from what A does on average."""
+    instrument = Instrument(bend=0.0, cross=0.0)
+    kind = type("Draws", (Push,), {"parametrization": Parametrization(stochastic=True)})
+    instrument.candidates[0] = Candidate(kind, "A", (0,), shape_error=error)
+    instrument.t[:, 0] *= 0.5
+    own, draws = instrument.t[:, 0] + np.sqrt(0.75) * instrument.sideways[0], np.random.default_rng(25).normal(size=48)
+    instrument.t[:, 2] = np.sqrt(1.0 - 0.3**2) * own + 0.3 * instrument.sideways[1]
+    drawn = instrument.t[:, 0] + np.sqrt(0.75) * draws[:, None] * instrument.sideways[0]
+
+    def respond(tables, skies):
+        (table,) = tables
+        straight = np.tile(instrument.t[:, 2], (skies, 1))
+        return float(table.parameters["amplitude"]) * (straight if table.channel == "C" else drawn[:skies])
+
+    monkeypatch.setattr(instrument, "respond", respond)
+    found = instrument.refined(snr * own).attribution
+    assert {one.members for one in found.explanations} == members
+
+
 @pytest.mark.parametrize("enough", [3.0, 30.0], ids=["suffices alone", "does not"])
 def test_a_stochastic_effect_is_tried_at_the_amplitude_that_it_has_alone(monkeypatch, enough):
     """Beside others its amplitude is 2, alone it is 14: that alone with the scatter of the latter suffices is found."""
