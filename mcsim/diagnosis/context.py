@@ -169,6 +169,10 @@ class DataSet(ABC, Generic[Data]):
         """Return data vectors of the same skies without effects and with them; None if errors do not need them."""
         return None
 
+    def in_same_skies(self, found: Sequence[config.Effect]) -> list[list[config.Effect]]:
+        """Return the effects in groups of which each is simulated in the same skies."""
+        return [list(found)]
+
     def rescaled(self, found: Sequence[config.Effect]) -> bool:
         """Return True if responses to effects depend on what these have done to the sky that the data are of."""
         return False

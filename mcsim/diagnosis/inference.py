@@ -110,15 +110,32 @@ def _scattered(data: DataSet[Any], members: Sequence[int], t: Matrix, scatters: 
     if scatters:
         return with_drawn_scatter(context.null, t, fit, scatters)
     with suppress(InputError):  # between what was fitted and what can be
-        if pair := data.pair(tables_at(context.candidates, members, first)):
+        groups = data.in_same_skies(tables_at(context.candidates, members, first))
+        pairs = [pair for own in groups if (pair := data.pair(own)) is not None]
+        for pair in pairs:
             fit = with_scatter(context.null, t, fit, *pair)
-            bend = context.null.whiten_templates(t - context.templates[:, columns_of(context.candidates, members)])
-            tables = tables_beside(context.candidates, members, first, bend, context.settings.nonlinear_sigma)
-            moved = [(step, None if one is None else data.pair(one)) for step, one in tables]
-            # The skies of responses are those without the gain of the effects, which moves as well.
-            slopes = [None if one is None else (one[1] - one[0] - (pair[1] - pair[0])) / step for step, one in moved]
-            fit = with_tangents(context.null, t, fit, slopes)
+        bend = context.null.whiten_templates(t - context.templates[:, columns_of(context.candidates, members)])
+        tables = tables_beside(context.candidates, members, first, bend, context.settings.nonlinear_sigma)
+        fit = with_tangents(context.null, t, fit, [_slope(data, groups, pairs, *one) for one in tables])
     return fit
+
+
+def _slope(
+    data: DataSet[Any],
+    groups: Sequence[Sequence[config.Effect]],
+    pairs: Sequence[tuple[Matrix, Matrix]],
+    step: float,
+    moved: Sequence[config.Effect] | None,
+) -> Matrix | None:
+    """Return the derivative of the response, (skies, p_raw), in the one amplitude that has moved by a step.
+
+    ``pairs`` are the data without and with the effects of ``groups``. The skies are those without the gain of the
+    effects, which moves as well.
+    """
+    for before, pair, after in zip(groups, pairs, () if moved is None else data.in_same_skies(moved), strict=False):
+        if after != before and (end := data.pair(after)) is not None:
+            return (end[1] - end[0] - (pair[1] - pair[0])) / step
+    return None
 
 
 def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:

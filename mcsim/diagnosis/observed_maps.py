@@ -88,6 +88,13 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         before, after = self.same_skies.pair(found, skies, True)
         return before[:, :size], after[:, :size]
 
+    def in_same_skies(self, found: Sequence[config.Effect]) -> list[list[config.Effect]]:
+        """Return effects of reference skies, since the observed sky has their power already, apart from all others."""
+        groups: tuple[list[config.Effect], list[config.Effect]] = ([], [])
+        for effect in found:
+            groups[self.same_skies.skies_of(effect) == "reference"].append(effect)
+        return [own for own in groups if own]
+
     def rescaled(self, found: Sequence[config.Effect]) -> bool:
         """Return True if the observed sky has to be found as effects let the channels see it."""
         return any(self.same_skies.seen(found))

@@ -1,12 +1,20 @@
 """Errors of fitted effects."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from mcsim import systematics
+from mcsim import config, systematics
 from mcsim.datavector.candidate import Candidate, tables_beside
+from mcsim.datavector.same_skies import SameSkies
 from mcsim.diagnosis.assemble import effects_of
-from mcsim.stats.gaussian import Fit
+from mcsim.diagnosis.inference import _scattered
+from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.stats.gaussian import Fit, SimulatedGaussian
+from mcsim.support.arrays import Matrix
+from mcsim.systematics import Parametrization
 
 
 def candidate_of(name: str) -> tuple[Candidate, int]:
@@ -57,3 +65,33 @@ def test_no_slope_is_taken_along_an_amplitude_that_the_effect_cannot_follow(name
     found = Fit(theta, 1e-6 * np.eye(size), 1000, 400.0, 1.0, 0.0, 1, 1.0)
     tables = [table for _, table in tables_beside([candidate], [0], found, np.full((1, size), 1e9), 0.3)]
     assert [table is not None for table in tables] == size * [followed]
+
+
+def test_each_effect_of_a_set_scatters_the_skies_in_which_its_response_is_measured() -> None:
+    """Beside a spectrum, measured in typical skies, errors of a modulation were those of a sky that is not observed."""
+    rng, size, skies = np.random.default_rng(8), 12, 8
+    null, t = SimulatedGaussian(np.zeros(size), np.eye(size), 1_000_000), np.eye(size)[:, :2]
+    mean = type("Spectrum", (systematics.get("calibration"),), {"parametrization": Parametrization(mean_response=True)})
+    library = {"calibration": systematics.get("calibration"), "spectrum": mean}
+    mean.name = "spectrum"
+    candidates = [Candidate(kind, None, (k,)) for k, kind in enumerate(library.values())]
+    analysis: Any = SimpleNamespace(library=library, model=SimpleNamespace(channels=("W1", "W2")))
+    same = SameSkies(analysis, lambda _: [], ())
+    asked: list[tuple[str, ...]] = []
+
+    def pair(found: list[config.Effect]) -> tuple[Matrix, Matrix]:
+        asked.append(tuple(one.name for one in found))
+        before = rng.normal(size=(skies, size))
+        typical = 5.0 * rng.normal(size=(skies, size)) * (len(found) > 1)
+        return before, (1.5 if found[0].name == "spectrum" else 1.0) * before + 20.0 * t[:, 0] + typical
+
+    data: Any = SimpleNamespace(same_skies=same, pair=pair)
+    data.in_same_skies = lambda found: ObservedMaps.in_same_skies(data, found)
+    data.context = SimpleNamespace(
+        null=null, candidates=candidates, templates=t, settings=SimpleNamespace(nonlinear_sigma=0.5)
+    )
+    fit = null.fit(t @ [0.2, 0.1], t)
+    found = _scattered(data, [0, 1], t, [], fit)
+    assert sorted(asked) == [("calibration",), ("spectrum",)]
+    # Noise that is 1.5 times as strong, and an eighth of what more is in the mean over as many skies.
+    np.testing.assert_allclose(found.errors / fit.errors, np.sqrt(1.5**2 + 0.5**2 / skies), rtol=1e-9)
