@@ -189,7 +189,7 @@ class DiagnosisSettings:
     simulations: int | None = None
     controls: int = 0
     alpha: float = 0.05
-    residual_level: float = 0.02
+    residual_level: float = 0.01
     further_level: float = 0.005
     max_effects: int = 6
     named_probability: float = 0.5
