@@ -139,7 +139,7 @@ def fit(
         print(json.dumps([one.to_dict() for one in fits], indent=2, ensure_ascii=False))
     else:
         print(beamfit.report(fits))
-    save(fit_figure(fits), target)
+    save(fit_figure(fits), target, aside=as_json)
 
 
 @app.command(cls=Command)

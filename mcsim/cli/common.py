@@ -131,8 +131,11 @@ def picture(asked: Path | None, shown: str | Path, end: str = "") -> Path:
     return target
 
 
-def save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]
-    """Save a figure and print its path; raise InputError if the file cannot be written, RunError on a full disk."""
+def save(figure, path: Path, aside: bool = False) -> None:  # type: ignore[no-untyped-def]
+    """Save a figure and print its path, ``aside`` to standard error, where standard output is for programs.
+
+    Raise InputError if the file cannot be written, RunError on a full disk.
+    """
     buffer = BytesIO()
     try:
         figure.savefig(buffer, format=path.suffix[1:].lower())
@@ -140,4 +143,4 @@ def save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]
         raise InputError(f"{path} cannot be written ({error}); choose another file with -o.") from error
     with unwritable(path, "choose another file with -o"):
         write_whole(path, buffer.getvalue())
-    print(f"wrote {path}")
+    print(f"wrote {path}", file=sys.stderr if aside else sys.stdout)
