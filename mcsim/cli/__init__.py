@@ -393,7 +393,7 @@ def effects(name: Annotated[str | None, Argument(metavar="EFFECT", help="Only th
         for bound in kind.bounds:
             print(f"  possible    {bound.parameter} from {bound.low:g} to {bound.high:g}: {bound.source}")
         if not kind.proposed:
-            print(f"  proposed    on request: mcsim diagnose --with {kind.name}")
+            print(f"  proposed    on request: mcsim diagnose --with {name or kind.name}")
         for key in ("cause", "signature", "source"):
             print(f"  {key:<11} {getattr(kind, key)}")
 

@@ -99,6 +99,9 @@ def test_effects_on_request_are_marked_and_proposed_when_asked_for(mcsim: Comman
     asked = "--with orbital_dipole"
     assert asked in mcsim("effects", "orbital_dipole")[1]
     assert "--with" not in mcsim("effects", "gain_drift")[1]
+    own = "from mcsim.systematics.added import OrbitalDipole\n\n\nclass Own(OrbitalDipole):\n    name = 'own_dipole'\n"
+    (tmp_path / "own.py").write_text(own)
+    assert "--with own.py" in mcsim("effects", "own.py")[1]
     model = """
 schema = 1
 name = "small"
