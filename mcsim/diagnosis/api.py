@@ -163,7 +163,8 @@ def describe(
 ) -> str:
     """Return a text on the cost of a diagnosis: simulations, memory, disk, time, and that of preparing the maps.
 
-    Data that are named are read, and refused as :func:`diagnose` refuses them.
+    Data that are named are read, and refused as :func:`diagnose` refuses them. It ends with what the verdict of real
+    maps would be warned of: sky power that the model lacks.
     """
     run, source = loaded(model)
     count, (settings, library, asked) = settings.controls, _with_library(settings)
@@ -189,6 +190,8 @@ def describe(
         )
     if count:
         lines += controls.describe(analysis, count, run.compute.workers)
+    if source is None and table is None:
+        lines += [f"warning: {sentence}" for sentence in _warnings(analysis)]
     return "\n".join(lines)
 
 

@@ -107,6 +107,8 @@ def test_a_model_that_lacks_power_of_the_sky_is_told_so(maps, tmp_path):
     with quick_pictures(empty=True):
         assert "Warning: sky.lmax = 20" in report.page(bare)
     assert mcsim.diagnosis.result.DiagnosisResult.open(tmp_path).warnings == bare.warnings
+    assert describe(model(20, steps=False), SETTINGS).splitlines()[-1] == f"warning: {bare.warnings[0]}"
+    assert "warning" not in describe(model(), SETTINGS)
 
 
 def test_the_cost_of_a_preparation_is_said():
