@@ -137,8 +137,7 @@ def diagnose(
         diagnosis = replace(diagnosis, controls=drawn, warnings=first, settings=done)
     if output is not None:
         with folders.filling(output):
-            report.write(diagnosis, output / "report.html")
-            diagnosis.save(output)
+            diagnosis.save(output, report.page(diagnosis))
     return diagnosis
 
 

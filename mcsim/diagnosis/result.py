@@ -23,9 +23,9 @@ from mcsim.reconstruction.result import HEAD, Reconstructed
 from mcsim.stats.excess import HeldOut, Measured, excess_of
 from mcsim.stats.look_elsewhere import GlobalTest
 from mcsim.support.arrays import Vector, texts
-from mcsim.support.folders import unreadable, write_whole
+from mcsim.support.folders import replacing, unreadable
 
-STORE = "diagnosis.zarr"
+VERDICT, REPORT, STORE = "verdict.json", "report.html", "diagnosis.zarr"
 PLACES = 12  #: groups in the localisation table of ``verdict.json`` and of the report
 
 
@@ -337,24 +337,28 @@ class DiagnosisResult:
         coordinates = {name: (dim, texts(each), {"long_name": words}) for name, (dim, each, words) in labels.items()}
         return xr.Dataset(variables, coordinates, {"result": json.dumps(rest, default=asdict)})
 
-    def save(self, folder: str | Path) -> None:
-        """Write ``verdict.json`` and ``diagnosis.zarr`` into a folder, made where it does not exist.
+    def save(self, folder: str | Path, page: str | None = None) -> None:
+        """Write ``verdict.json``, ``diagnosis.zarr`` and ``report.html``, the page, into a folder.
 
-        Reconstructed effects are written there too, a Python file each; those of an earlier verdict that this one does
-        not use are deleted.
+        It is made where it does not exist. Reconstructed effects are written there too, a Python file each. What an
+        earlier diagnosis has written there is deleted, effects that this one does not use and a report included.
+        ``verdict.json`` comes last: a process that is killed leaves a folder without it, with files of one diagnosis.
         """
         target = Path(folder)
-        target.mkdir(parents=True, exist_ok=True)
-        written = {one.name: one.file for one in self.unlisted or () if one.file is not None}
+        written = {f"{one.name}.py": one.file for one in self.unlisted or () if one.file is not None}
+        written |= {} if page is None else {REPORT: page}
+        written[VERDICT] = json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n"
         used = {one.name for one in self.candidates}
         used |= {Path(one["name"]).stem for one in json.loads(self.configuration).get("effect") or ()}
-        for path in target.glob("unlisted_*.py"):
-            if path.stem not in used | set(written) and HEAD in path.read_text(encoding="utf-8", errors="replace"):
-                path.unlink()
-        for name, text in written.items():
-            write_whole(target / f"{name}.py", text)
-        write_dataset(self.to_dataset(), target / STORE)
-        write_whole(target / "verdict.json", json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n")
+        earlier = [
+            path.name
+            for path in target.glob("unlisted_*.py")
+            if path.stem not in used and HEAD in path.read_text(encoding="utf-8", errors="replace")
+        ]
+        with replacing(target, VERDICT, REPORT, *earlier) as scratch:
+            for name, text in written.items():
+                (scratch / name).write_text(text, encoding="utf-8")
+            write_dataset(self.to_dataset(), scratch / STORE)
 
     @classmethod
     def open(cls, folder: str | Path) -> "DiagnosisResult":

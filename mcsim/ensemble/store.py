@@ -25,7 +25,7 @@ from zarr.storage import MemoryStore
 
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.errors import InputError, RunError
-from mcsim.support.folders import appearing, is_full, outside_stores, real_path, unwritable
+from mcsim.support.folders import appearing, is_full, outside_stores, real_path, remove, unwritable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -345,8 +345,7 @@ def write_dataset(dataset: "xr.Dataset", folder: Path, **form: Any) -> None:
         dataset.to_zarr(MemoryStore(files), **({"consolidated": True} | form))
     with appearing(folder) as scratch:
         _write_files(files, scratch)
-        if (place := real_path(folder)).is_dir():
-            shutil.rmtree(place)
+        remove(real_path(folder))
 
 
 def _write_files(files: Files, folder: Path) -> None:

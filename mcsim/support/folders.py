@@ -51,12 +51,7 @@ def appearing(path: Path) -> Iterator[Path]:
     path = real_path(path)
     not_a_file(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    host = f".{socket.gethostname()}."
-    for left in path.parent.glob(f".*{escape(host)}*.*"):
-        number = left.name.rpartition(host)[2].partition(".")[0]
-        if number.isdecimal() and not alive(int(number)):
-            shutil.rmtree(left, ignore_errors=True)
-    scratch = Path(tempfile.mkdtemp(prefix=scratch_prefix(path.name), dir=path.parent))
+    scratch = _scratch(path)
     try:
         yield scratch
         scratch.chmod(0o755)  # a temporary folder is readable by its owner alone
@@ -67,6 +62,45 @@ def appearing(path: Path) -> Iterator[Path]:
                 raise
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+@contextmanager
+def replacing(folder: Path, last: str, *former: str) -> Iterator[Path]:
+    """Yield a scratch folder; at the end all that it holds takes the place of what has these names in ``folder``.
+
+    If the block fails, what is there stays. Otherwise all of it, and ``former``, goes before anything new comes, with
+    ``last`` first: a process that is killed leaves files of one call alone, and ``last`` only beside all others.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    scratch = _scratch(folder / last)
+    try:
+        yield scratch
+        names = sorted({path.name for path in scratch.iterdir()} | {*former}, key=lambda name: name != last)
+        for name in names:
+            remove(real_path(folder / name))
+        for name in reversed(names):
+            if (scratch / name).exists():
+                shutil.move(scratch / name, real_path(folder / name))
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def remove(path: Path) -> None:
+    """Delete a file, or a folder at once and not file by file, if it is there."""
+    if path.is_dir():
+        shutil.rmtree(path.rename(_scratch(path)))
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _scratch(path: Path) -> Path:
+    """Make a scratch folder beside ``path``; delete those that killed processes of this host have left there."""
+    host = f".{socket.gethostname()}."
+    for left in path.parent.glob(f".*{escape(host)}*.*"):
+        number = left.name.rpartition(host)[2].partition(".")[0]
+        if number.isdecimal() and not alive(int(number)):
+            shutil.rmtree(left, ignore_errors=True)
+    return Path(tempfile.mkdtemp(prefix=scratch_prefix(path.name), dir=path.parent))
 
 
 def not_a_file(path: Path) -> None:

@@ -423,8 +423,11 @@ def test_a_beam_that_no_effect_changes_has_no_single_name(small):
 
 def test_the_verdict_is_json_and_the_evidence_opens(small, tmp_path):
     found = diagnose_data(ObservedMaps(small, list(simulate.maps(data_of(small.run), 0)), ask), "saved")
-    found.save(tmp_path / "out")
+    found.save(tmp_path / "out", "page")
     assert json.loads((tmp_path / "out" / "verdict.json").read_text())["schema"] == 1
+    assert (tmp_path / "out" / "report.html").read_text() == "page"
+    found.save(tmp_path / "out")  # whose report is none of this call
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["diagnosis.zarr", "verdict.json"]
 
 
 def test_responses_on_the_observed_sky_have_the_mean_of_those_on_any(small):

@@ -68,6 +68,46 @@ def stop(folder):
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted((other.name, "three", "two"))
 
 
+STEP = """
+import os, pathlib, shutil, signal, sys
+from mcsim.support.folders import replacing
+left, text = map(int, sys.argv[2:])
+def killed(real):
+    def step(*given, **named):
+        global left
+        left -= 1
+        if left < 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(*given, **named)
+    return step
+pathlib.Path.unlink, pathlib.Path.rename = killed(pathlib.Path.unlink), killed(pathlib.Path.rename)
+shutil.move, shutil.rmtree = killed(shutil.move), killed(shutil.rmtree)
+with replacing(pathlib.Path(sys.argv[1]), "last", "former") as scratch:
+    (scratch / "store").mkdir()
+    for name in ("last", "other", "store/a", "store/b", *(["former"] if text == 1 else [])):
+        (scratch / name).write_text(str(text))
+"""
+
+
+def test_files_that_belong_together_are_replaced_together_whenever_the_process_is_killed(tmp_path):
+    """An old verdict stood beside a new report."""
+    whole = {"last", "other", "store/a", "store/b"}
+    for step in range(20):
+        folder = tmp_path / str(step)
+        for left, text in ((99, 1), (step, 2)):
+            ended = subprocess.run([sys.executable, "-c", STEP, folder, str(left), str(text)]).returncode
+        names = [str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()]
+        found = {name: (folder / name).read_text() for name in names if not name.startswith(".")}
+        assert len(set(found.values())) <= 1
+        assert "last" not in found or whole <= found.keys()
+        assert len({"store/a", "store/b"} & found.keys()) != 1
+        if ended == 0:
+            break
+    assert step > 5
+    assert found == dict.fromkeys(whole, "2")
+    assert sorted(path.name for path in folder.iterdir()) == ["last", "other", "store"]
+
+
 def test_what_is_made_behind_a_link_is_there(tmp_path):
     (tmp_path / "disk" / "folder").mkdir(parents=True)
     (tmp_path / "link").symlink_to(tmp_path / "disk" / "folder")
