@@ -16,7 +16,7 @@ from mcsim import systematics
 from mcsim.benchmark.summary import ALPHA, FAR, NAMED, REDUCED, Confusion, Score, confusion
 from mcsim.stats.intervals import Metric, binomial_interval
 from mcsim.support import page
-from mcsim.support.folders import filling, write_whole
+from mcsim.support.folders import filling, replacing
 
 DOTS_PER_INCH = 110
 BLUE, RED, GREY = "#1f5fa8", "#c44e22", "0.45"
@@ -54,10 +54,11 @@ def write(score: Score, folder: Path) -> None:
         picture=page.embedded(picture),
         version=version("mcsim"),
     )
-    with filling(folder):
-        write_whole(folder / "score.json", json.dumps([_plain(content)], indent=1, allow_nan=False) + "\n")
-        write_whole(folder / "score.png", picture)
-        write_whole(folder / "report.html", text)
+    with filling(folder), replacing(folder, "score.json") as scratch:
+        (scratch / "score.png").write_bytes(picture)
+        (scratch / "report.html").write_text(text, encoding="utf-8")
+        plain = json.dumps([_plain(content)], indent=1, allow_nan=False) + "\n"
+        (scratch / "score.json").write_text(plain, encoding="utf-8")
 
 
 def lines(score: Score) -> list[str]:

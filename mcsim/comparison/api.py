@@ -133,9 +133,9 @@ def compare(
     result = ComparisonResult(case, tuple(found), sides.not_compared)
     if output is not None:
         text = json.dumps(result.to_dict(), indent=1, allow_nan=False) + "\n"
-        with folders.filling(target := Path(output)):
-            folders.write_whole(target / "compare.json", text)
-            folders.write_whole(target / "report.html", report.page(result))
+        with folders.filling(target := Path(output)), folders.replacing(target, "compare.json") as scratch:
+            (scratch / "report.html").write_text(report.page(result), encoding="utf-8")
+            (scratch / "compare.json").write_text(text, encoding="utf-8")
     return result
 
 

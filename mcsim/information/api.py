@@ -31,7 +31,7 @@ from mcsim.support.numbers import duration
 from mcsim.support.progress import reporting
 from mcsim.support.settings import settings_of
 
-PICTURE, DOTS_PER_INCH = "limit.png", 100
+DOTS_PER_INCH = 100
 
 RESPONSE = 3.0  #: cost of a response over that of the circular maps of a sky, on average over the library
 
@@ -126,9 +126,7 @@ def limit(
     tests = sum(not _is_nuisance(candidate, settings) for candidate in analysis.candidates)
     found = limits_of(candidates, information, tests, method, run.name, settings)
     if output is not None:
-        found.save(output)
-        with folders.unwritable(output, "choose another folder"):
-            folders.write_whole(output / PICTURE, page.png(figure.limit_figure(found), DOTS_PER_INCH))
+        found.save(output, page.png(figure.limit_figure(found), DOTS_PER_INCH))
     return found
 
 

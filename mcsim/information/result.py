@@ -15,10 +15,10 @@ from mcsim.information.fisher import Information
 from mcsim.information.settings import LimitSettings
 from mcsim.stats.detection import snr_needed, snr_to_separate
 from mcsim.support.arrays import Matrix, Vector, divided, texts
-from mcsim.support.folders import unwritable, write_whole
+from mcsim.support.folders import replacing, unwritable
 from mcsim.support.numbers import number
 
-TABLE, STORE = "limit.json", "limit.zarr"
+TABLE, STORE, PICTURE = "limit.json", "limit.zarr", "limit.png"
 
 RESOLVED = 1e-10  #: directions of an effect with less than this share of its largest information are unconstrained
 
@@ -191,13 +191,18 @@ class Limits:
         attributes["unknowns"] = self.unknowns
         return xr.Dataset(columns, coordinates, attributes)
 
-    def save(self, folder: str | Path) -> None:
-        """Write ``limit.json`` and ``limit.zarr`` into a folder, made where it does not exist."""
+    def save(self, folder: str | Path, picture: bytes | None = None) -> None:
+        """Write ``limit.zarr``, the picture as ``limit.png``, and last ``limit.json``, in place of earlier ones.
+
+        The folder is made where it does not exist.
+        """
         target = Path(folder)
-        with unwritable(target, "choose another folder"):
-            target.mkdir(parents=True, exist_ok=True)
-            write_dataset(self.to_dataset(), target / STORE)
-            write_whole(target / TABLE, json.dumps(self.to_json(), indent=2, ensure_ascii=False) + "\n")
+        with unwritable(target, "choose another folder"), replacing(target, TABLE, PICTURE) as scratch:
+            write_dataset(self.to_dataset(), scratch / STORE)
+            if picture is not None:
+                (scratch / PICTURE).write_bytes(picture)
+            text = json.dumps(self.to_json(), indent=2, ensure_ascii=False) + "\n"
+            (scratch / TABLE).write_text(text, encoding="utf-8")
 
 
 def marginalised(fisher: Matrix, nuisances: Sequence[int], widths: Sequence[float]) -> Matrix:
