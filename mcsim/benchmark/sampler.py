@@ -83,9 +83,7 @@ class CaseSampler:
         for index, candidate in enumerate(self.effects_library.candidates):
             largest = float(np.max(np.linalg.norm(self._white(index), axis=0)))
             # Of an effect without response and without a limit the product is NaN, which is not larger.
-            amplitudes = [one.high for one in candidate.effect.bounds if one.parameter == "amplitude"]
-            limit = min([candidate.parametrization.max_amplitude, *amplitudes])
-            if limit * largest >= self.prior.weakest:
+            if candidate.largest * largest >= self.prior.weakest:
                 found.setdefault(candidate.name, {}).setdefault(candidate.channel, []).append(index)
         return {name: list(channels.values()) for name, channels in found.items()}
 

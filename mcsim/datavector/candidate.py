@@ -105,6 +105,12 @@ class Candidate:
         return {name: float(getattr(usual, name)) for name in self.parametrization.measured}
 
     @property
+    def largest(self) -> float:
+        """Return the largest absolute amplitude that the effect can have; infinite if nothing bounds it."""
+        ends = [max(abs(one.low), abs(one.high)) for one in self.effect.bounds if one.parameter == "amplitude"]
+        return min([self.parametrization.max_amplitude, *ends])
+
+    @property
     def random_response(self) -> bool:
         """Return True if its templates are measured from random draws, not from an effect that is taken away."""
         return self.parametrization.stochastic and self.parametrization.sign >= 0

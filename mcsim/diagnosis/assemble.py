@@ -207,11 +207,21 @@ def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[Candida
             delta_chi2=null.hartlap_factor * float(found.singles[k].delta_chi2),
             pvalue=min(1.0, float(pvalues[k]) * int((rank > 0).sum())),
             detectable=size,
-            detectable_words="–" if size is None else candidate.effect.format_amplitude(size) + at,
+            detectable_words=_in_words(candidate, size, at),
             fixed=fixed,
             similar=similar,
             correlation=cosine,
             strength=strength,
             separable=separable,
-            separable_words=candidate.effect.format_amplitude(separable) + at if np.isfinite(separable) else "–",
+            separable_words=_in_words(candidate, separable, at),
+            largest=candidate.largest,
         )
+
+
+def _in_words(candidate: Candidate, size: float | None, at: str) -> str:
+    """Return an amplitude as people read it, ``at`` parameters, and that the effect cannot have it where this is so."""
+    if size is None or not np.isfinite(size):
+        return "–"
+    return (
+        candidate.effect.format_amplitude(size) + at + (", more than is possible" if size > candidate.largest else "")
+    )

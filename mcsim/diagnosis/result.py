@@ -109,6 +109,7 @@ class CandidateResult:
     strength: float
     separable: float
     separable_words: str
+    largest: float = np.inf  #: largest absolute amplitude that the effect can have; infinite in earlier results
 
     @property
     def significance(self) -> float:
@@ -295,6 +296,7 @@ class DiagnosisResult:
             "detectable": [
                 {key: getattr(one, key) for key in ("name", "channel", "unit")}
                 | {"settings": {**one.settings, **one.fixed}, "amplitude_90": one.detectable}
+                | {"amplitude_max": one.largest if np.isfinite(one.largest) else None}
                 for one in self.candidates
                 if one.detectable is not None
             ],

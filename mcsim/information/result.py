@@ -44,6 +44,8 @@ class EffectLimit:
         Index of the other effect with the most similar response, None without one, and their canonical correlation.
     separable
         Amplitude at which the right one of the two is chosen with the probability asked for; NaN without another one.
+    amplitude_max
+        Largest absolute amplitude that the effect can have; infinite if nothing bounds it.
     """
 
     name: str
@@ -60,6 +62,12 @@ class EffectLimit:
     similar: int | None
     correlation: float
     separable: float
+    amplitude_max: float = np.inf
+
+    def amplitude(self, key: str) -> str:
+        """Return one of the amplitudes as text, with an asterisk if the effect cannot have it."""
+        value = float(getattr(self, key))
+        return number(value) + ("*" if self.amplitude_max < value < np.inf else "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,15 +133,17 @@ class Limits:
         for one in self.effects:
             similar = ("–", "–", "–")
             if one.similar is not None:
-                similar = (self.effects[one.similar].label, f"{one.correlation:.2f}", number(one.separable))
-            amplitudes = (one.sigma, one.amplitude_90_known, one.amplitude_90)
-            rows.append((one.label, one.unit, *map(number, amplitudes), *similar))
+                similar = (self.effects[one.similar].label, f"{one.correlation:.2f}", one.amplitude("separable"))
+            detected = (one.amplitude(key) for key in ("amplitude_90_known", "amplitude_90"))
+            rows.append((one.label, one.unit, number(one.sigma), *detected, *similar))
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         side = ["<", "<", ">", ">", ">", "<", ">", ">"]
         table = ["  ".join(f"{cell:{side[i]}{widths[i]}}" for i, cell in enumerate(row)) for row in rows]
         worst = max((one.error for one in self.effects), default=0.0)
         error = f" Errors of sigma from random probes: at most {100 * worst:.2g} %." if worst else ""
-        said = [self.conventions, f"{self.method}.{error}", self.unknowns]
+        beyond = "*: more than the effect can have (mcsim effects says what is possible)."
+        marked = beyond if any(cell.endswith("*") for row in rows for cell in row) else ""
+        said = [marked, self.conventions, f"{self.method}.{error}", self.unknowns]
         return [*(line.rstrip() for line in table), *filter(None, said)]
 
     def to_json(self) -> dict[str, Any]:
@@ -158,6 +168,7 @@ class Limits:
         similar = None if other is None else {key: getattr(other, key) for key in ("name", "channel", "settings")}
         named = {key: getattr(one, key) for key in ("name", "channel", "settings", "unit", "components")}
         amplitudes = {key: getattr(one, key) for key in ("sigma", "amplitude_90_known", "amplitude_90", "separable")}
+        amplitudes["amplitude_max"] = one.amplitude_max
         finite = {key: value if np.isfinite(value) else None for key, value in amplitudes.items()}
         return named | finite | {"sigma_relative_error": one.error, "similar": similar, "correlation": one.correlation}
 
@@ -287,6 +298,7 @@ def limits_of(
                 similar,
                 rho,
                 sigma * apart,
+                candidate.largest,
             )
         )
     names = tuple(f"{one.label}/{k}" for one in left for k in range(len(one.columns)))
