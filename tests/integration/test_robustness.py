@@ -124,6 +124,15 @@ def test_merge_refuses_different_contents_and_leaves_nothing(small_store: Path, 
     assert sorted(p.name for p in tmp_path.glob("*.zarr")) == ["kept.zarr"]
 
 
+def test_merge_of_a_store_with_itself_is_refused_by_name(small_store: Path, tmp_path: Path) -> None:
+    """Typed in place of another slice, it was taken twice without a word."""
+    (tmp_path / "link.zarr").symlink_to(small_store)
+    for other in (small_store, small_store.parent / "." / small_store.name, tmp_path / "link.zarr"):
+        with refused(small_store, other):
+            runner.merge([small_store, other], tmp_path / "merged.zarr")
+    assert not (tmp_path / "merged.zarr").exists()
+
+
 def test_merge_of_a_short_and_a_long_ensemble_is_the_long_one(
     small_store: Path, client: Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -38,7 +38,7 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     Raises
     ------
     InputError
-        If the stores are not of one configuration, or ``path`` exists or is within a store.
+        If the stores are not of one configuration, one is named twice, or ``path`` exists or is within a store.
     RunError
         If the disk is full; nothing of the new store is left.
 
@@ -59,6 +59,11 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     first = store.attributes(sources[0])
     for other in sources[1:]:
         plan.check_mergeable(sources[0], first, other, store.attributes(other))
+    named: dict[str, Path] = {}
+    for source in sources:
+        if (before := named.setdefault(os.path.realpath(source), source)) is not source:
+            twice = f"{source} is named twice" if source == before else f"{source} is the store {before}"
+            raise InputError(f"{twice}, and a merge takes each store once; name another slice, or leave it out.")
     size = max(store.size(source) for source in sources)
     layout = opening.layout(sources[0], size)
     first["configuration"]["ensemble"]["realizations"] = size
