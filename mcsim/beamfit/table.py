@@ -76,10 +76,15 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
     sigma = np.concatenate(sigmas) if errors else np.ones_like(value)
     bad = np.flatnonzero(~(np.isfinite(value) & np.isfinite(sigma) & (sigma > 0.0)))
     if len(bad):
-        row = rows[bad[0]]
+        row, above = rows[bad[0]], max(rows[number].ell_min for number in bad) + 1
+        remedy = "give finite values with errors above 0, or leave the row out"
+        if suffix and not np.isfinite(sigma).any():
+            remedy = "fit the plain spectra (--kind plain), or take errors from a store (--covariance)"
+        elif any(one.ell_min >= above for one in rows):
+            remedy += f" (--ell-min {above} leaves out all such rows)"
         raise InputError(
             f"{path}: {row.mode.name} at ell = {row.ell_min}-{row.ell_max} has value {value[bad[0]]:g}, error "
-            f"{sigma[bad[0]]:g}; give finite values with errors above 0, or leave the row out."
+            f"{sigma[bad[0]]:g}; {remedy}."
         )
     covariance, highest = np.diag(sigma**2), highest_of(path, table.meta)
     return Measurement(str(path), label, chosen, tuple(rows), scaling, value, covariance, None, highest=highest)

@@ -165,6 +165,22 @@ def test_bins_that_overlap_are_not_independent(tmp_path):
     read_table(tmp_path / "table.ecsv", "ecliptic", errors=False)
 
 
+def test_rows_without_an_error_are_refused_with_an_option_that_leaves_them_out(tmp_path):
+    """On a full sky without noise the lowest degrees are predicted without scatter, and differences without errors."""
+    ends = {"ell_min": [2, 3, 4], "ell_max": [2, 3, 4], "d": [0, 0, 0], "error": [0.0, 0.0, 0.3]}
+    more = {"value_difference": [1.0, 2.0, 3.0], "error_difference": [np.nan] * 3}
+    with refused("L2M0d0", "2-2", "--ell-min 4"):
+        read(tmp_path, table(**ends))
+    assert len(read(tmp_path, table(**ends), ell_range=(4, 4)).rows) == 1
+    with refused("L2M0d0", "2-2", "--kind", "--covariance") as caught:
+        read(tmp_path, table(**ends, **more))
+    assert "--ell-min" not in str(caught.value)
+    assert len(read(tmp_path, table(**ends, **more), ell_range=(4, 4), kind="plain").rows) == 1
+    with refused("4-4") as caught:
+        read(tmp_path, table(**ends | {"error": [0.1, 0.2, 0.0]}))
+    assert "--ell-min" not in str(caught.value)
+
+
 def test_errors_that_do_not_count_may_be_missing(tmp_path):
     made = table(error=[np.nan, 0.0, 0.3])
     with refused("L2M0d0", "error"):
