@@ -227,7 +227,8 @@ def _plane_block(model: Model, part: int) -> Block:
     """Measure the residual along the Galactic plane, against its mean over the sky."""
     profile = 1.0 / (1.0 + (sine_of_latitude(model.frame, "galactic", model.nside) / model.settings.plane_width) ** 2)
     profile -= profile.mean()
-    whole = replace(of_map(model, part), ell=(2, model.settings.large_scales), frame="galactic", kind="plane")
+    ends = 2, min(model.settings.large_scales, model.lmax)
+    whole = replace(of_map(model, part), ell=ends, frame="galactic", kind="plane")
     element = replace(whole, name=f"plane/{whole.name}", L=2, M=0, parity="even")
     return Block((element,), lambda filtered: float(filtered.residual[part] @ profile))
 

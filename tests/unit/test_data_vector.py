@@ -40,6 +40,14 @@ def test_a_mean_is_weighted_with_the_inverse_variance_of_its_own_map_alone(analy
     np.testing.assert_allclose(found, [0.0, expected, 0.0, 0.0], rtol=1e-5, atol=1e-5 * expected)
 
 
+def test_no_element_names_degrees_that_the_filters_do_not_have(analysis) -> None:
+    """The Galactic plane was one of degrees 2 to 64 in a model that ends at 40."""
+    elements = (*analysis.elements, *analysis.slices, *analysis.bipolar_scan.elements)
+    ends = {element.kind: element.ell for element in elements if element.ell is not None}
+    assert max(last for _, last in ends.values()) == analysis.model.lmax
+    assert ends["plane"] == (2, analysis.model.lmax)
+
+
 def test_elements_scale_as_their_units_say(analysis) -> None:
     """A sky, a dipole, noise and maps of twice the temperature: 2 to the power of µK in the unit."""
     factor, maps = 2.0, list(simulate.maps(survey(analysis.run), 0))
