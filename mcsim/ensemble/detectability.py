@@ -38,7 +38,7 @@ def _total_cl(survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[i
 
 
 def sky_fraction(survey: Survey, pair: tuple[int, int]) -> float:
-    """Return <W_x W_y>^2 / <W_x^2 W_y^2>."""
+    """Return <W_x W_y>^2 / <W_x^2 W_y^2> of the weights W: the modes that are left."""
     weights = [np.ones(1) if m.weight is None else m.weight for m in survey.maps]
     x, y = (weights[index] for index in pair)
     return float(np.mean(x * y) ** 2 / np.mean((x * y) ** 2))

@@ -77,11 +77,6 @@ class SurveyMap:
         done = None if self.preparation is None else self.preparation.weight()
         return self.weight if self.weight is None or done is None else divided(self.weight, done)
 
-    @property
-    def sky_fraction(self) -> float:
-        """<W^2>^2 / <W^4> of the weight W: the modes that are left, and what variances are divided by."""
-        return 1.0 if self.weight is None else float(np.mean(self.weight**2) ** 2 / np.mean(self.weight**4))
-
 
 @dataclass(frozen=True)
 class SideB:
@@ -172,11 +167,6 @@ class Survey:
         """Labels of the pairs, for example ``W1:half1,W1:half2``."""
         names = self.map_names
         return tuple(f"{names[x]},{names[y]}" for x, y in self.pairs)
-
-    @property
-    def sky_fractions(self) -> dict[str, float]:
-        """Effective fraction of the sky of every map; see :attr:`SurveyMap.sky_fraction`."""
-        return {m.name: m.sky_fraction for m in self.maps}
 
 
 def survey(

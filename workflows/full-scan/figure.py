@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 import mcsim
 from mcsim import beamfit, config
+from mcsim.ensemble.detectability import sky_fraction
 from mcsim.instrument import scan
 from mcsim.simulation.channels import load_beam
 from mcsim.simulation.survey import survey
@@ -175,7 +176,7 @@ def report(folder: Path, ell: np.ndarray) -> None:
 
 def report_mask(summaries: dict[str, xr.Dataset]) -> None:
     """Print the mask's mean field, and what the mask does to the error bars."""
-    fraction = survey(config.load(HERE / "full-scan-masked.toml")).sky_fractions["W1"]
+    fraction = sky_fraction(survey(config.load(HERE / "full-scan-masked.toml")), (0, 0))
     print(f"mask: effective f_sky = <W^2>^2 / <W^4> = {fraction:.3f}, 1 / sqrt(f_sky) = {fraction**-0.5:.2f}")
     for mode in MODES:
         both = [summaries[run].sel(pair="W1,W1", mode=mode) for run in ("full-scan", "full-scan-masked")]
