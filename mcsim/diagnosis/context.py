@@ -38,8 +38,7 @@ class DiagnosisContext:
     calibration: Calibration  # of the candidates
     sky_scatter: Vector  # relative scatter of each candidate's response among skies, (candidates,)
     templates: Matrix  # (p, K), noisy ones without the elements that are only noise
-    groups: WhitenedTemplates  # the same, white, candidate by candidate
-    always: WhitenedTemplates  # those of candidates that are proposed whatever the data are
+    always: WhitenedTemplates  # those of candidates that are proposed whatever the data are, white, one by one
 
     @property
     def run(self) -> config.RunConfig:
@@ -83,7 +82,7 @@ def context(analysis: Analysis, ensemble: NullEnsemble, bank: TemplateBank) -> D
         candidates, templates = with_nuisances(ensemble, null, analysis.nuisances, candidates, templates)
     groups = null.whiten_groups(templates, [candidate.columns for candidate in candidates])
     calibration = calibration_of(ensemble, null, groups)
-    return DiagnosisContext(analysis, ensemble, bank, null, candidates, calibration, scatter, templates, groups, groups)
+    return DiagnosisContext(analysis, ensemble, bank, null, candidates, calibration, scatter, templates, groups)
 
 
 def calibration_of(ensemble: NullEnsemble, null: SimulatedGaussian, groups: WhitenedTemplates) -> Calibration:

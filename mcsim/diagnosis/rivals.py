@@ -106,5 +106,4 @@ def with_candidates(context: DiagnosisContext, more: Sequence[tuple[Candidate, M
         candidates=candidates,
         sky_scatter=np.append(context.sky_scatter, np.zeros(len(added))),
         templates=templates,
-        groups=context.null.whiten_groups(templates, [one.columns for one in candidates]),
     )

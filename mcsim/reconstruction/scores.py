@@ -100,9 +100,7 @@ class Scene:
     nside: int
     lmax: int
     dipole_uk: Vector  #: that the survey sees besides, shape (3,)
-    #: cl, sky_power: spectrum of the sky, and that of the filtered sky over it, shape (lmax + 1,)
-    cl: Cl
-    sky_power: Cl
+    cl: Cl  #: spectrum of the sky, shape (lmax + 1,)
     split_orders: int  #: highest order of a beam that is measured in each map by itself
     views: tuple[View, ...]  #: maps, channel by channel
     #: directions elsewhere in the frame of each channel's beam (x, y, outward) with weights, shape (n, 4), by what

@@ -76,7 +76,6 @@ class Found:
     """A structure that is there."""
 
     structure: int  #: index in the grammar
-    evidence: float  #: logarithm of its odds against none, in what those found before it leave
     #: global p-value: probability that the best of all structures has as large an evidence in data of the model
     pvalue: float
     delta_chi2: float  #: fall of chi^2, unbiased
@@ -163,7 +162,7 @@ class Search:
             own = self.grammar[members[best]]
             rival = next((k for k in near if less[k] < np.log(RIVAL) and not own.like(self.grammar[k])), None)
             near.sort(key=lambda k: k != rival)  # it is told first
-            found.append(Found(members[best], float(values.max()), p, float(falls[best]), tuple(near), rival))
+            found.append(Found(members[best], p, float(falls[best]), tuple(near), rival))
             if (own.stage, own.kind) == ("added", "power"):  # nobody knows what such a pattern leaves in other scores
                 break
             chosen = [one.structure for one in found]

@@ -145,7 +145,6 @@ def scene_of(model: Model) -> Scene:
         lmax=model.lmax,
         dipole_uk=np.asarray(model.survey.channels[0].site.dipole_uk),
         cl=model.cl,
-        sky_power=model.sky_power,
         split_orders=model.settings.split_beam_orders,
         views=tuple(views),
         elsewhere=tuple(elsewhere),

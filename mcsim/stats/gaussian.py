@@ -52,8 +52,6 @@ class WhitenedTemplates:
 
     basis: NDArray[np.float64]  #: shape (p, r_1 + r_2 + ...)
     start: NDArray[np.int64]  #: first column of each group, and the end of the last
-    #: matrix of each group from basis coordinates to amplitudes, shape (K_c, r_c)
-    back: tuple[NDArray[np.float64], ...]
 
     @property
     def sizes(self) -> NDArray[np.int64]:
@@ -158,11 +156,8 @@ class SimulatedGaussian:
     def whiten_groups(self, t: NDArray[np.float64], groups: Sequence[Sequence[int]]) -> WhitenedTemplates:
         """Return orthonormal white bases of groups of columns of the templates ``t``, shape (p_raw, K)."""
         white = self.whiten_templates(t)
-        pairs = [orthonormal(white[:, list(group)]) for group in groups]
-        start = np.cumsum([0] + [basis.shape[1] for basis, _ in pairs])
-        return WhitenedTemplates(
-            np.concatenate([basis for basis, _ in pairs], axis=1), start, tuple(back for _, back in pairs)
-        )
+        bases = [orthonormal(white[:, list(group)])[0] for group in groups]
+        return WhitenedTemplates(np.concatenate(bases, axis=1), np.cumsum([0] + [one.shape[1] for one in bases]))
 
     def chi2(self, x: NDArray[np.float64]) -> float:
         """Return chi^2 of data, shape (p_raw,): n (x - mean)' S^-1 (x - mean)/(1 + 1/N)."""

@@ -258,7 +258,7 @@ def true(number):
         rivals = list(sky.responses(asked, context.settings.channel_skies))
         linear = linear_model(context)
         own = {"null": linear.null, "calibration": linear.calibration, "templates": linear.templates}
-        known = replace(context, candidates=linear.candidates, groups=linear.groups, **own)
+        known = replace(context, candidates=linear.candidates, **own)
         kept = len(context.ensemble.simulations) - len(linear.data)
         every, wide = context.ensemble.extended, context.ensemble.first(kept).extended.gaussian
         data, whole = (
