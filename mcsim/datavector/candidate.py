@@ -36,7 +36,6 @@ class Candidate:
     channel: str | None  # None: all
     columns: tuple[int, ...]  # in the matrix of templates, one for each of its linear components
     settings: Mapping[str, Any] = field(default_factory=dict)  # parameters that are not fitted
-    prior: float = 1.0  # weight relative to the other candidates
     shape_error: float | None = None  # relative error of its templates in white norm; None: that of the settings
     # Deviations of its response from the mean one if it is stochastic, shape (p, draws), as
     # SimulatedGaussian.with_extra_covariance takes them; None if they are not known.

@@ -335,17 +335,6 @@ def test_amplitude_beside_a_scatter_is_honest(bench):
     assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.4
 
 
-def test_prior_moves_the_odds():
-    t = directions(2, 17)
-    t[:, 1] = t[:, 0] + 0.05 * t[:, 1]
-    plain, favoured = Bench(t, singles(2)), Bench(t, [singles(2)[0], candidate("effect1", None, (1,), prior=9.0)])
-    ratios = []
-    for bench in (plain, favoured):
-        odds = {e.members: e.odds for e in bench.diagnose_maps(9.0 * t[:, 0], 3).explanations}
-        ratios.append(odds[(1,)] / odds[(0,)])
-    assert ratios[1] / ratios[0] == pytest.approx(9.0)
-
-
 def test_sixty_candidates_take_less_than_two_seconds():
     t = np.random.default_rng(18).normal(size=(P, 90))
     candidates = [candidate(f"effect{i}", None, (i,) if i < 40 else (i, i + 30)) for i in range(60)]
