@@ -19,7 +19,6 @@ from mcsim.simulation import tod
 from mcsim.support import folders
 from mcsim.support.arrays import Map, divided
 from mcsim.support.code import class_digest, package_digest
-from mcsim.support.compiled import njit
 from mcsim.support.npy import write_npy
 from mcsim.systematics import Effect, Site, adding, basis_of, spread_of
 
@@ -94,10 +93,10 @@ def mean_signal(acting: tuple[Effect, ...], site: Site, part: Part) -> Map | Non
         chunk = tod.shrunk(chunk, site.nside, spread)
         terms = (effect.signal(chunk.time_s, chunk.theta, chunk.phi, chunk.psi, site) for effect in found)
         chunk = replace(chunk, signal_uk=sum(terms, start=chunk.signal_uk))
-        _add(chunk.pixel, chunk.signal_uk, whole)
+        tod.add_samples(chunk.pixel, chunk.signal_uk, whole)
         if part.rings is not None:
             for ring in tod.every_ring(pointing.model.spin_period_s, *part.rings)([chunk]):
-                _add(ring.pixel, ring.signal_uk, own)
+                tod.add_samples(ring.pixel, ring.signal_uk, own)
     return np.ascontiguousarray(_means(own, whole)[0])
 
 
@@ -108,14 +107,6 @@ def _means(own: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.f
     """
     chosen = np.where(own[:, :1] > 0.0, own, whole)
     return divided(chosen[:, 1:].T, chosen[:, 0])
-
-
-@njit(nogil=True)
-def _add(pixel, value, sums):  # type: ignore[no-untyped-def]
-    """Add samples to hits and sums of values."""
-    for k in range(pixel.size):
-        sums[pixel[k], 0] += 1.0
-        sums[pixel[k], 1] += value[k]
 
 
 def gain_of(effect: Effect, site: Site, part: Part, orders: int = 0) -> NDArray[np.complex128]:

@@ -213,14 +213,14 @@ def bin_samples(stream: Iterable[Samples], nside: int) -> tuple[Map, Map]:
     """Return the mean signal of every pixel in uK, ``healpy.UNSEEN`` where there is none, and hits, shape (npix,)."""
     check_nside(nside)
     sums = np.zeros((12 * nside * nside, 2))  # side by side: half as many cache misses
-    total, hits = sums.T
+    hits, total = sums.T
     for chunk in stream:
         check_shape(chunk.signal_uk, chunk.pixel.shape, "the signal of a chunk of samples")
         if chunk.pixel.size and not 0 <= chunk.pixel.min() <= chunk.pixel.max() < hits.size:
             raise InputError(
                 f"a sample is in pixel {chunk.pixel.max()}, but nside {nside} has {hits.size}; give its own nside."
             )
-        _add(chunk.pixel, chunk.signal_uk, sums)
+        add_samples(chunk.pixel, chunk.signal_uk, sums)
     return divided(total, hits, healpy.UNSEEN), hits.copy()
 
 
@@ -242,7 +242,8 @@ def observe(
 
 
 @njit(nogil=True)
-def _add(pixel, signal, sums):  # type: ignore[no-untyped-def]
+def add_samples(pixel, value, sums):  # type: ignore[no-untyped-def]
+    """Add samples to hits and sums of values, shape (npix, 2)."""
     for k in range(pixel.size):
-        sums[pixel[k], 0] += signal[k]
-        sums[pixel[k], 1] += 1.0
+        sums[pixel[k], 0] += 1.0
+        sums[pixel[k], 1] += value[k]
