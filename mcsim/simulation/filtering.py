@@ -300,7 +300,9 @@ class Filtering:
             return tuple(Response(self._exact(number)).checked() for number in range(len(self.pairs)))
 
         def fill(folder: Path) -> None:
-            matrices, factors = zip(*self._estimated(progress), strict=True)
+            probes = self.probed(progress)
+            each = (self.response(probes, number) for number in range(len(self.pairs)))
+            matrices, factors = zip(*each, strict=True)
             np.savez(folder / "fisher.npz", *matrices, factors=factors)
 
         with np.load(folders.cached(f"filter-{self._key()}", fill) / "fisher.npz") as stored:
@@ -429,10 +431,6 @@ class Filtering:
     def _exact(self, number: int) -> Matrix:
         bands, pair = self.bands[number], self.pairs[number]
         return np.diag(bands.uniform(bands.products(*self._totals(pair))))
-
-    def _estimated(self, progress: Progress | None) -> list[Response]:
-        probes = self.probed(progress)
-        return [self.response(probes, number) for number in range(len(self.pairs))]
 
     def _key(self) -> str:
         """Return what the normalisation depends on, hashed."""

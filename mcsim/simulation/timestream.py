@@ -85,10 +85,6 @@ class CorrelatedNoise:
     pairs: csr_matrix | None  #: samples of every baseline in every pixel; None: the map is binned
     level_uk: Map
 
-    def draw(self, seed: int, realization: int) -> Map:
-        """Return the noise of a realization, uK, shape (npix,), 0 where nothing is observed; destriped, of mean 0."""
-        return self._drawn(seed, realization, self.streams)
-
     def with_knee(self, f_knee_hz: float) -> Self:
         """Return the noise with another knee, of the same random numbers: at f_min or below it is white.
 
@@ -98,11 +94,12 @@ class CorrelatedNoise:
         most = math.nextafter(nyquist_hz(self.model), 0.0)
         return replace(self, noise=replace(self.noise, f_knee_hz=min(max(f_knee_hz, least), most)))
 
-    def _drawn(self, seed: int, realization: int, streams: str) -> Map:
+    def draw(self, seed: int, realization: int) -> Map:
+        """Return the noise of a realization, uK, shape (npix,), 0 where nothing is observed; destriped, of mean 0."""
         in_pixels, in_baselines = np.zeros(self.grid.npix), np.zeros(0 if self.pairs is None else self.pairs.shape[0])
         first = 0
         for line in self.model.select():
-            draw = rng.generator(seed, realization, f"{streams}/{line.name}")
+            draw = rng.generator(seed, realization, f"{self.streams}/{line.name}")
             following = noise_samples(self.noise, 1.0 / self.model.period_of_samples(line), draw)
             for chunk, baseline in _timed(self, line, _adding(following)):
                 in_pixels += np.bincount(chunk.pixel, weights=chunk.signal_uk, minlength=in_pixels.size)
@@ -184,8 +181,8 @@ def _fill(folder: Path, empty: CorrelatedNoise) -> None:
         made = replace(made, pairs=csr_matrix((count, pixel, begin), shape=(total, hits.size)))
         for name in ("data", "indices", "indptr"):
             write_npy(folder / f"{name}.npy", getattr(made.pairs, name))
-    drawn = [made._drawn(0, r, f"level of {empty.streams}") for r in range(LEVEL_DRAWS)]
-    level = math.sqrt(np.mean([per_hit(each, hits) ** 2 for each in drawn]))
+    other = replace(made, streams=f"level of {empty.streams}")
+    level = math.sqrt(np.mean([per_hit(other.draw(0, r), hits) ** 2 for r in range(LEVEL_DRAWS)]))
     write_npy(folder / "hits.npy", hits)
     write_npy(folder / "level.npy", np.sqrt(divided(np.full(hits.size, level**2), hits)))
 
