@@ -121,7 +121,7 @@ def kept(write: Callable[[Path], Any], what: str) -> Path:
                     shutil.move(path, folder / path.name)
 
             name = f"given-{hashlib.sha256(contents.encode()).hexdigest()}"
-            return folders.cached(name, move, root).absolute()
+            return folders.cached(name, move).absolute()
     except OSError as error:
         raise (RunError if folders.is_full(error) else InputError)(
             f"cache folder {str(root)!r} cannot take what is given as {what} ({error.strerror}); make room there, or "

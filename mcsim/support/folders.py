@@ -228,14 +228,14 @@ def default_cache_dir() -> Path:
     return Path.home() / ".cache" / "mcsim"
 
 
-def cached(name: str, fill: Callable[[Path], None], cache_dir: str | Path | None = None) -> Path:
-    """Return a folder of the cache (default: :func:`default_cache_dir`); if it is not whole, ``fill`` an empty one.
+def cached(name: str, fill: Callable[[Path], None]) -> Path:
+    """Return a folder of the cache (:func:`default_cache_dir`); if it is not whole, ``fill`` an empty one.
 
     The name of the folder identifies everything that its content depends on. Some clusters delete files of a scratch
     disk one by one as they grow old, a computer that stops leaves empty ones, and disks change bits: such a folder is
     made again. A process reads each file once for that, 0.6 s for 1 GB in memory.
     """
-    root = default_cache_dir() if cache_dir is None else Path(cache_dir)
+    root = default_cache_dir()
     folder = root / name
     if not _is_whole(folder):
         try:

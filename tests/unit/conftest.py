@@ -48,6 +48,14 @@ def folder(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
+@pytest.fixture
+def cache(tmp_path, monkeypatch) -> Path:
+    """Empty folder that is the cache of one test."""
+    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "cache").mkdir()
+    return tmp_path / "cache"
+
+
 def changed(plain: dict, key: str, value: object) -> dict:
     """Copy with the dotted key (numbers index lists) set, or removed."""
     result = copy.deepcopy(plain)

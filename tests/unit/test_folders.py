@@ -129,24 +129,24 @@ def test_a_file_in_the_way_is_an_error(tmp_path):
 @pytest.mark.parametrize(
     ("number", "kind"), [(errno.ENOSPC, RunError), (errno.EDQUOT, RunError), (errno.EROFS, InputError)]
 )
-def test_a_full_disk_is_no_bad_input(tmp_path, number, kind):
+def test_a_full_disk_is_no_bad_input(cache, number, kind):
     def fail(folder=None):
         raise OSError(number, os.strerror(number))
 
     with refused("MCSIM_CACHE", by=kind, errno=number):
-        cached("name", fail, tmp_path)
-    with refused(tmp_path, by=kind, errno=number) as caught, unwritable(tmp_path, "choose another"):
+        cached("name", fail)
+    with refused(cache, by=kind, errno=number) as caught, unwritable(cache, "choose another"):
         fail()
     assert ("choose another" in str(caught.value)) == (kind is InputError)
 
 
-def test_a_lost_connection_is_not_blamed_on_the_cache(tmp_path):
+def test_a_lost_connection_is_not_blamed_on_the_cache(cache):
     def lost(folder):
         raise TimeoutError(7)
 
     with refused(7, by=TimeoutError):
-        cached("name", lost, tmp_path)
-    assert list(tmp_path.iterdir()) == []
+        cached("name", lost)
+    assert list(cache.iterdir()) == []
 
 
 def flipped(path):
@@ -160,7 +160,7 @@ def flipped(path):
     "how",
     [lambda path: path.write_bytes(b""), lambda path: path.unlink(), lambda path: path.write_bytes(flipped(path))],
 )
-def test_a_cached_folder_that_has_lost_files_is_filled_again(tmp_path, lost, how):
+def test_a_cached_folder_that_has_lost_files_is_filled_again(cache, lost, how):
     """Scratch disks delete old files and keep their folders: a learned model without one gave another verdict."""
     filled = []
 
@@ -170,19 +170,19 @@ def test_a_cached_folder_that_has_lost_files_is_filled_again(tmp_path, lost, how
         (folder / "b").mkdir()
         (folder / "b" / "c").write_bytes(b"5")
 
-    folder = cached("x/name", fill, tmp_path)
-    assert cached("x/name", fill, tmp_path) == folder
+    folder = cached("x/name", fill)
+    assert cached("x/name", fill) == folder
     assert len(filled) == 1
     for name in lost:
         how(folder / name)
         if (folder / name).exists():
             os.utime(folder / name, (1, 1))  # the clock of a file system may stand still for some ms
-    assert cached("x/name", fill, tmp_path) == folder
+    assert cached("x/name", fill) == folder
     assert ((folder / "a").read_bytes(), (folder / "b" / "c").read_bytes()) == (b"1234", b"5")
     assert len(filled) == 2
-    assert [path.name for path in (tmp_path / "x").iterdir()] == ["name"]
+    assert [path.name for path in (cache / "x").iterdir()] == ["name"]
     (folder / ".content.json").write_text('{"a": 4, "b/c": 1}')  # of an earlier version
-    cached("x/name", fill, tmp_path)
+    cached("x/name", fill)
     assert len(filled) == 2
 
 

@@ -30,13 +30,13 @@ EXACT = mapmaking.StoppingRule(1e-12)
 
 
 @pytest.fixture(scope="module")
-def scan(tmp_path_factory) -> mapmaking.DifferencingScan:
-    return mapmaking.prepare(MODEL, "D", GRID, cache_dir=tmp_path_factory.mktemp("pairs"))
+def scan() -> mapmaking.DifferencingScan:
+    return mapmaking.prepare(MODEL, "D", GRID)
 
 
 @pytest.fixture(scope="module")
-def fine_scan(tmp_path_factory) -> mapmaking.DifferencingScan:
-    return mapmaking.prepare(MODEL, "D", MapGrid(32), cache_dir=tmp_path_factory.mktemp("pairs"), nthreads=2)
+def fine_scan() -> mapmaking.DifferencingScan:
+    return mapmaking.prepare(MODEL, "D", MapGrid(32), nthreads=2)
 
 
 @pytest.fixture(scope="module")
@@ -96,10 +96,10 @@ def test_partners_are_merged_and_in_order(scan):
     assert np.all(np.diff(key) > 0)
 
 
-def test_a_pixel_may_be_its_own_partner(tmp_path):
+def test_a_pixel_may_be_its_own_partner():
     """Sides 30 degrees apart in pixels of 58 degrees."""
     near = replace(MODEL, lines_of_sight=(SIDES[0], LineOfSight("B", 60.0, 30.0)))
-    scan = mapmaking.prepare(near, "D", replace(SHORT, nside=1), cache_dir=tmp_path)
+    scan = mapmaking.prepare(near, "D", replace(SHORT, nside=1))
     matrix = np.zeros((scan.samples, 12))
     for line, weight in zip(near.lines_of_sight, (1.2, -0.8), strict=True):
         theta, phi, _ = pointing(near, line, 0, scan.samples)
@@ -108,36 +108,36 @@ def test_a_pixel_may_be_its_own_partner(tmp_path):
     np.testing.assert_allclose(normal_matrix(scan, 0.2), matrix.T @ matrix, atol=1e-9)
 
 
-def test_bands_and_threads_do_not_change_the_pairs(scan, tmp_path, monkeypatch):
+def test_bands_and_threads_do_not_change_the_pairs(scan, cache, monkeypatch):
     monkeypatch.setattr(pairs, "_BAND", 5_000)
-    other = mapmaking.prepare(MODEL, "D", GRID, cache_dir=tmp_path, nthreads=2)
+    other = mapmaking.prepare(MODEL, "D", GRID, nthreads=2)
     for name in ("hits_a", "hits_b", "row_start", "partner", "count"):
         np.testing.assert_array_equal(getattr(other, name), getattr(scan, name))
         assert getattr(other, name).dtype == getattr(scan, name).dtype
 
 
-def test_pairs_are_computed_once(tmp_path, monkeypatch):
+def test_pairs_are_computed_once(cache, monkeypatch):
     fractions = []
-    first = mapmaking.prepare(MODEL, "D", SHORT, cache_dir=tmp_path, progress=fractions.append)
+    first = mapmaking.prepare(MODEL, "D", SHORT, progress=fractions.append)
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1.0
-    assert [path.name.split("-")[0] for path in tmp_path.iterdir()] == ["pairs"]
+    assert [path.name.split("-")[0] for path in cache.iterdir()] == ["pairs"]
     with monkeypatch.context() as patch:
         patch.delattr(pairs, "_write")
-        again = mapmaking.prepare(MODEL, "D", SHORT, cache_dir=tmp_path)
+        again = mapmaking.prepare(MODEL, "D", SHORT)
     np.testing.assert_array_equal(again.partner, first.partner)
     assert isinstance(again.partner, np.memmap)
     # Another imbalance needs no other pairs; exchanged sides, frames and parts do.
-    mapmaking.prepare(MODEL, "R", SHORT, cache_dir=tmp_path)
-    mapmaking.prepare(MODEL, "D", replace(SHORT, frame="galactic"), cache_dir=tmp_path)
-    mapmaking.prepare(MODEL, "D", replace(SHORT, time_range=(0.01, 0.02)), cache_dir=tmp_path)
-    assert len(list(tmp_path.iterdir())) == 4
+    mapmaking.prepare(MODEL, "R", SHORT)
+    mapmaking.prepare(MODEL, "D", replace(SHORT, frame="galactic"))
+    mapmaking.prepare(MODEL, "D", replace(SHORT, time_range=(0.01, 0.02)))
+    assert len(list(cache.iterdir())) == 4
 
 
-def test_damaged_pairs_are_made_again(tmp_path):
-    first = np.array(mapmaking.prepare(MODEL, "D", SHORT, cache_dir=tmp_path).partner)
-    next(tmp_path.glob("*/partner.raw")).write_bytes(b"")
-    np.testing.assert_array_equal(mapmaking.prepare(MODEL, "D", SHORT, cache_dir=tmp_path).partner, first)
+def test_damaged_pairs_are_made_again(cache):
+    first = np.array(mapmaking.prepare(MODEL, "D", SHORT).partner)
+    next(cache.glob("*/partner.raw")).write_bytes(b"")
+    np.testing.assert_array_equal(mapmaking.prepare(MODEL, "D", SHORT).partner, first)
 
 
 @pytest.mark.parametrize("x", [0.0, 0.02])
@@ -288,8 +288,8 @@ def test_nothing_observed_gives_nothing(scan):
     assert report == mapmaking.MapmakingReport(0, True, 0.0, ())
 
 
-def test_unseen_pixels_say_so(tmp_path):
-    scan = mapmaking.prepare(MODEL, "D", MapGrid(32, time_range=(0.0, 0.02)), cache_dir=tmp_path)
+def test_unseen_pixels_say_so():
+    scan = mapmaking.prepare(MODEL, "D", MapGrid(32, time_range=(0.0, 0.02)))
     side = np.random.default_rng(10).standard_normal((scan.npix, 1))
     found, _ = mapmaking.solve(
         scan, mapmaking.rhs_from_maps(scan, [(side, side)])[0], rule=mapmaking.StoppingRule(1e-6)
@@ -343,13 +343,18 @@ def test_maps_of_another_nside_are_refused(scan):
     [
         ({"pair": "X"}, ("'X'", "D, R")),
         ({"grid": MapGrid(4, time_range=(0.0, 1e-9))}, ("time_range", "(0, 1e-09)")),
-        ({"cache_dir": "/dev/null/pairs"}, ("/dev/null/pairs", "MCSIM_CACHE")),
         (
             {"model": replace(MODEL, lines_of_sight=(SIDES[0], replace(SIDES[1], sample_period_s=50.0)))},
             ("78.9 s", "50 s", "sample_period_s"),
         ),
     ],
 )
-def test_bad_input_to_the_pairs_is_named(changes, named, tmp_path):
+def test_bad_input_to_the_pairs_is_named(changes, named):
     with refused(*named):
-        mapmaking.prepare(**({"model": MODEL, "pair": "D", "grid": SHORT, "cache_dir": tmp_path} | changes))
+        mapmaking.prepare(**({"model": MODEL, "pair": "D", "grid": SHORT} | changes))
+
+
+def test_cache_that_cannot_be_written_is_named(monkeypatch):
+    monkeypatch.setenv("MCSIM_CACHE", "/dev/null/pairs")
+    with refused("/dev/null/pairs", "MCSIM_CACHE"):
+        mapmaking.prepare(MODEL, "D", SHORT)

@@ -174,30 +174,30 @@ def test_moments_saved_in_the_place_of_others_are_whole_or_none(tmp_path, monkey
         Moments.load(tmp_path / "m")
 
 
-def test_cache_computes_once_and_leaves_nothing_behind(tmp_path, monkeypatch):
-    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
-    assert default_cache_dir() == tmp_path / "cache"
+def test_cache_computes_once_and_leaves_nothing_behind(cache):
+    assert default_cache_dir() == cache
     folder = cached_moments(MODEL, MapGrid(NSIDE), 2)
     stamp = (folder / "w.npy").stat().st_mtime_ns
     assert cached_moments(MODEL, MapGrid(NSIDE), 2, nthreads=2) == folder
     assert (folder / "w.npy").stat().st_mtime_ns == stamp
-    assert [entry.name for entry in (tmp_path / "cache").iterdir()] == [folder.name]
+    assert [entry.name for entry in cache.iterdir()] == [folder.name]
     np.testing.assert_array_equal(Moments.load(folder).hits, Moments.from_model(MODEL, NSIDE, 2).hits)
 
 
-def test_interrupted_computation_leaves_the_cache_empty(tmp_path):
+def test_interrupted_computation_leaves_the_cache_empty(cache):
     def interrupt(fraction):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        cached_moments(MODEL, MapGrid(NSIDE), 2, progress=interrupt, cache_dir=tmp_path)
-    assert list(tmp_path.iterdir()) == []
+        cached_moments(MODEL, MapGrid(NSIDE), 2, progress=interrupt)
+    assert list(cache.iterdir()) == []
 
 
-def test_cache_folder_that_cannot_be_written(tmp_path):
+def test_cache_folder_that_cannot_be_written(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
+    monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "file"))
     with refused("MCSIM_CACHE"):
-        cached_moments(MODEL, MapGrid(NSIDE), 2, cache_dir=tmp_path / "file")
+        cached_moments(MODEL, MapGrid(NSIDE), 2)
 
 
 def test_key_depends_on_every_number_and_on_nothing_else():

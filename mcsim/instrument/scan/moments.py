@@ -431,20 +431,15 @@ def scan_key(model: ScanModel, grid: MapGrid, smax: int = 0) -> str:
 
 
 def cached_moments(
-    model: ScanModel,
-    grid: MapGrid,
-    smax: int,
-    nthreads: int = 1,
-    progress: Callable[[float], None] | None = None,
-    cache_dir: str | Path | None = None,
+    model: ScanModel, grid: MapGrid, smax: int, nthreads: int = 1, progress: Callable[[float], None] | None = None
 ) -> Path:
     """Return the folder, for :meth:`Moments.load`, with the moments of a survey's default lines of sight.
 
-    They are streamed (:func:`mcsim.instrument.scan.accumulate.stream_sums`) if they are not in the cache yet:
-    ``cache_dir``, by default that of all commands. The folder appears whole or not; InputError if it cannot be written.
+    They are streamed (:func:`mcsim.instrument.scan.accumulate.stream_sums`) if they are not in the cache yet. The
+    folder appears whole or not; InputError if it cannot be written.
     """
 
     def fill(folder: Path) -> None:
         Moments._from_sums(stream_sums(model, grid, smax, nthreads, progress), grid).save(folder)
 
-    return folders.cached(f"moments-{scan_key(model, grid, smax)}", fill, cache_dir)
+    return folders.cached(f"moments-{scan_key(model, grid, smax)}", fill)

@@ -72,19 +72,13 @@ class DifferencingScan:
 
 
 def prepare(
-    model: ScanModel,
-    pair: str,
-    grid: MapGrid,
-    cache_dir: str | Path | None = None,
-    nthreads: int = 1,
-    progress: Callable[[float], None] | None = None,
+    model: ScanModel, pair: str, grid: MapGrid, nthreads: int = 1, progress: Callable[[float], None] | None = None
 ) -> DifferencingScan:
     """Return the pairs of pixels of a differencing scan, computed once and memory-mapped from then on.
 
-    ``pair`` names one of the model's differencing pairs (assemblies), ``cache_dir`` the folder to keep them in (None:
-    :func:`mcsim.support.folders.default_cache_dir`); ``progress`` takes the fraction done. The result does not depend
-    on the threads, bit for bit. InputError if the pair is unknown, its sides are sampled at different rates, the time
-    range contains no sample, or the cache cannot be written.
+    ``pair`` names one of the model's differencing pairs (assemblies); ``progress`` takes the fraction done. The result
+    does not depend on the threads, bit for bit. InputError if the pair is unknown, its sides are sampled at different
+    rates, the time range contains no sample, or the cache cannot be written.
 
     Notes
     -----
@@ -107,7 +101,7 @@ def prepare(
 
     code = package_digest([__name__, "mcsim.simulation.tod"])
     seen = scan_key(model.with_lines_of_sight(*(side.name for side in sides)), grid)
-    folder = folders.cached(f"pairs-{seen[:32]}-{code[:32]}", fill, cache_dir)
+    folder = folders.cached(f"pairs-{seen[:32]}-{code[:32]}", fill)
     return DifferencingScan(model, *sides, grid, **_load(folder))
 
 
