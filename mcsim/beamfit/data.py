@@ -126,10 +126,7 @@ def is_of_one_map(pair: str | None) -> bool:
 
 
 def project(
-    rows: Sequence[Row],
-    scaling: Scaling,
-    spectra: Mapping[Mode, NDArray[np.complex128]],
-    highest: int | None = None,
+    rows: Sequence[Row], scaling: Scaling, spectra: Mapping[Mode, NDArray[np.complex128]], highest: int | None = None
 ) -> NDArray[np.float64]:
     """Return data vectors, shape (..., rows), of spectra of shape (..., lmax + 1); NaN where a bin is empty.
 

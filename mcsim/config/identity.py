@@ -57,13 +57,7 @@ def _contents_of(path: Path) -> str:
     return file_digest(path)
 
 
-_MAP = {
-    "grid": "healpix",
-    "nside": None,
-    "mask_frame": None,
-    "mask_apodisation_deg": 0.0,
-    "split_by": "time",
-}
+_MAP = {"grid": "healpix", "nside": None, "mask_frame": None, "mask_apodisation_deg": 0.0, "split_by": "time"}
 _OF_KIND: dict[str, dict[str, Any]] = {
     "moments": {"model": None, "line_of_sight": None},
     "map": {"angle_deg": 0.0},

@@ -130,10 +130,7 @@ class Rotate:
     frame: Frame
 
 
-Step = Annotated[
-    Degrade | Smooth | SubtractDipole | Templates | Fill | Mask | Rotate,
-    Field(discriminator="kind"),
-]
+Step = Annotated[Degrade | Smooth | SubtractDipole | Templates | Fill | Mask | Rotate, Field(discriminator="kind")]
 STEPS = (Degrade, Smooth, SubtractDipole, Templates, Fill, Mask, Rotate)
 
 

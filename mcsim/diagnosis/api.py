@@ -156,9 +156,7 @@ def _with_library(settings: DiagnosisSettings) -> tuple[DiagnosisSettings, syste
 
 
 def describe(
-    model: str | Path | config.RunConfig | ExternalModel,
-    settings: DiagnosisSettings,
-    data: str | Path | None = None,
+    model: str | Path | config.RunConfig | ExternalModel, settings: DiagnosisSettings, data: str | Path | None = None
 ) -> str:
     """Return a text on the cost of a diagnosis: simulations, memory, disk, time, and that of preparing the maps.
 
@@ -255,10 +253,7 @@ def prepared(run: config.RunConfig, analysis: Analysis, ask: campaign.Ask) -> Di
 
 
 def _learned(
-    key: str,
-    run: config.RunConfig,
-    analysis: Analysis,
-    ask: campaign.Ask,
+    key: str, run: config.RunConfig, analysis: Analysis, ask: campaign.Ask
 ) -> tuple[NullEnsemble, TemplateBank]:
     """Simulate a model or load it from the cache; single simulations stay for the verdict after a first one alone."""
     simulations = analysis.settings.simulations
@@ -290,8 +285,5 @@ def _key(run: config.RunConfig, analysis: Analysis, settings: DiagnosisSettings 
         package_digest((f"mcsim.{name}" for name in CODE), LIBRARIES),
     ]
     if analysis.source is not None:
-        rest += [
-            analysis.source.identity(),
-            package_digest(f"mcsim.ensemble.{name}" for name in EXTERNAL),
-        ]
+        rest += [analysis.source.identity(), package_digest(f"mcsim.ensemble.{name}" for name in EXTERNAL)]
     return hashlib.sha256(json.dumps([science, rest], sort_keys=True).encode()).hexdigest()[:32]

@@ -257,13 +257,7 @@ def describe(
     memory, *rest = found.lines(len(missing), workers or run.compute.workers)
     disk = float(found.layout.realization_bytes()) * len(missing)
     return "\n".join(
-        [
-            first,
-            *held,
-            memory,
-            f"  disk    {disk / 1e6:.1f} MB in about {found.layout.files()} files",
-            *rest,
-        ]
+        [first, *held, memory, f"  disk    {disk / 1e6:.1f} MB in about {found.layout.files()} files", *rest]
     )
 
 

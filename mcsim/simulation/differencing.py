@@ -161,11 +161,7 @@ def _mean(sides: Sides) -> Map:
 
 
 def _rhs(
-    channel: Channel,
-    skies: list[Sides],
-    dipole: NDArray[np.complex128] | None,
-    draw: tuple[int, int],
-    nthreads: int,
+    channel: Channel, skies: list[Sides], dipole: NDArray[np.complex128] | None, draw: tuple[int, int], nthreads: int
 ) -> Iterator[tuple[SurveyMap, NDArray[np.float64]]]:
     """Yield every map with its right-hand sides, shape (skies, npix); ``draw`` has seed and realization.
 

@@ -50,11 +50,7 @@ def noise_samples(noise: NoiseCorrelated, sampling_hz: float, draw: np.random.Ge
     before the first sample.
     """
     source = ducc0.misc.OofaNoise(
-        sigmawhite=noise.sigma0_uk,
-        f_knee=noise.f_knee_hz,
-        f_min=noise.f_min_hz,
-        f_samp=sampling_hz,
-        slope=-noise.alpha,
+        sigmawhite=noise.sigma0_uk, f_knee=noise.f_knee_hz, f_min=noise.f_min_hz, f_samp=sampling_hz, slope=-noise.alpha
     )
 
     def following(number: int) -> Map:

@@ -256,11 +256,7 @@ VARIANCE = ("II_COV", "VARIANCE", "I_VAR", "COV_II", "VAR_I", "VAR")
 
 
 def read_map(
-    path: Path,
-    names: tuple[str, ...] = (),
-    frame: str | None = None,
-    bad: float = healpy.UNSEEN,
-    alone: bool = True,
+    path: Path, names: tuple[str, ...] = (), frame: str | None = None, bad: float = healpy.UNSEEN, alone: bool = True
 ) -> tuple[Map, str | None, str | None]:
     """Read a map of a HEALPix FITS file in RING order, and its frame and unit if the header has them.
 

@@ -40,12 +40,7 @@ def power(strength: float, columns: int, threshold: float, dimension: int, simul
 
 
 def snr_needed(
-    columns: int,
-    tests: int,
-    dimension: int,
-    simulations: int | None,
-    alpha: float = 0.05,
-    target: float = 0.9,
+    columns: int, tests: int, dimension: int, simulations: int | None, alpha: float = 0.05, target: float = 0.9
 ) -> float:
     """Return the signal-to-noise ratio at which one of ``tests`` candidates is detected with power ``target``.
 

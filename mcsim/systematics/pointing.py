@@ -138,10 +138,7 @@ class TimeConstant(Effect):
     step = 0.001
     bounds = (
         Bound(
-            "amplitude",
-            -2.0,
-            2.0,
-            "a prior of this library: far beyond the main time constant of any bolometer in use",
+            "amplitude", -2.0, 2.0, "a prior of this library: far beyond the main time constant of any bolometer in use"
         ),
     )
 

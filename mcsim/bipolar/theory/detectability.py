@@ -154,10 +154,7 @@ def signal_to_noise(
 
 
 def fisher_information(
-    biposh: NDArray[np.complex128],
-    modes: Sequence[Indices],
-    cl_total: NDArray[np.float64],
-    f_sky: float = 1.0,
+    biposh: NDArray[np.complex128], modes: Sequence[Indices], cl_total: NDArray[np.float64], f_sky: float = 1.0
 ) -> float:
     """Return the information 1/2 Tr[C^-1 dC C^-1 dC] of a BipoSH signal in all maps jointly.
 

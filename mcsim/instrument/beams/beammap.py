@@ -223,9 +223,7 @@ def blm_of_map(beam_map: BeamMap, lmax: int, mmax: int) -> NDArray[np.complex128
     return unpacked(alm, lmax, mmax)
 
 
-def solid_angle_values(
-    beam_map: BeamMap,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def solid_angle_values(beam_map: BeamMap) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return response times solid angle, theta and phi of the pixels within the cut that are not zero."""
     image, pixel_rad = beam_map.image, beam_map.pixel_rad
     x = (np.arange(image.shape[1]) - beam_map.centre[0])[None, :] * pixel_rad
@@ -243,11 +241,7 @@ _Function = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 _PROJECTIONS: dict[Projection, tuple[_Function, _Function, _Function]] = {
     "equidistant": (lambda theta: theta, lambda radius: radius, lambda radius: np.sinc(radius / pi)),
     "orthographic": (np.sin, np.arcsin, lambda radius: 1 / np.sqrt(1 - radius**2)),
-    "equal_area": (
-        lambda theta: 2 * np.sin(theta / 2),
-        lambda radius: 2 * np.arcsin(radius / 2),
-        np.ones_like,
-    ),
+    "equal_area": (lambda theta: 2 * np.sin(theta / 2), lambda radius: 2 * np.arcsin(radius / 2), np.ones_like),
 }
 
 

@@ -25,11 +25,7 @@ _CACHE_LINE = 64
 
 
 def stream_sums(
-    model: ScanModel,
-    grid: MapGrid,
-    smax: int,
-    nthreads: int = 1,
-    progress: Callable[[float], None] | None = None,
+    model: ScanModel, grid: MapGrid, smax: int, nthreads: int = 1, progress: Callable[[float], None] | None = None
 ) -> NDArray[np.float64]:
     """Return the sums per pixel (:func:`pixel_sums`) of a survey's default lines of sight, by streaming every sample.
 
