@@ -12,6 +12,7 @@ import xarray as xr
 from astropy.io.fits.verify import VerifyWarning
 from astropy.table import Table
 
+from mcsim.ensemble.store import write_dataset
 from mcsim.errors import InputError
 from mcsim.support.folders import unreadable, unwritable, user_path, writable
 
@@ -104,10 +105,7 @@ def write(summary: xr.Dataset, output: str | Path) -> None:
 
 def _write(summary: xr.Dataset, target: Path) -> None:
     if target.suffix == ".zarr":
-        with warnings.catch_warnings():
-            # Zarr warns that its consolidated metadata and strings are not yet standard.
-            warnings.simplefilter("ignore", category=UserWarning)
-            summary.to_zarr(target, zarr_format=3, consolidated=True)
+        write_dataset(summary, target)
     elif target.suffix == ".nc":
         _for_netcdf(summary).to_netcdf(target, engine="scipy")
     else:
