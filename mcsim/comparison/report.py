@@ -2,7 +2,6 @@
 
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import healpy
 import numpy as np
@@ -12,6 +11,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from mcsim.comparison.result import ChannelResult, ComparisonResult
+from mcsim.plot.sky import mollweide
 from mcsim.sphere import healpix
 from mcsim.support import page as page_
 from mcsim.support.numbers import number
@@ -63,21 +63,11 @@ def _draw_map(axes: Axes, values: NDArray[np.float64], title: str) -> None:
     """Draw a Mollweide view, its colours up to the 99.5th percentile of |value|."""
     nside = min(SHOWN, healpy.npix2nside(values.size))
     coarse = healpy.ud_grade(np.where(np.isfinite(values), values, healpy.UNSEEN), nside)
-    projector: Any = healpy.projector.MollweideProj(xsize=500)
-    image = projector.projmap(coarse, lambda x, y, z: healpy.vec2pix(nside, x, y, z))
-    image = np.ma.masked_invalid(np.where(np.isneginf(image) | (image == healpy.UNSEEN), np.nan, image))
+    coarse = np.where(coarse == healpy.UNSEEN, np.nan, coarse)
     middle = float(np.nanmean(values))
     largest = float(np.nanquantile(np.abs(values - middle), 0.995)) or 1.0
-    shown = axes.imshow(
-        image,
-        origin="lower",
-        extent=projector.get_extent(),
-        cmap="RdBu_r",
-        vmin=middle - largest,
-        vmax=middle + largest,
-    )
+    shown = mollweide(axes, coarse, 500, cmap="RdBu_r", vmin=middle - largest, vmax=middle + largest)
     axes.set_title(f"{title}: rms {number(float(np.nanstd(values)))} µK", fontsize=10, parse_math=False)
-    axes.axis("off")
     axes.figure.colorbar(
         shown, ax=axes, orientation="horizontal", shrink=0.7, aspect=30, pad=0.02, ticks=MaxNLocator(4)
     ).set_label("µK")
