@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Literal
 
@@ -44,6 +44,11 @@ class SameSkies:
     analysis: Analysis
     ask: Ask
     maps: Sequence[Map]
+    # Data vectors without any effect, as many as were needed so far. Keys are True for constrained skies, for an
+    # external simulator, and how the maps were seen that constrain them.
+    _before: dict[tuple[bool, bool, Seen], list[Vector]] = field(default_factory=lambda: defaultdict(list), init=False)
+    # What was simulated ahead, by all that tells such jobs apart.
+    _ahead: dict[tuple[str, int, int, bytes], Matrix] = field(default_factory=dict, init=False)
 
     @property
     def observed(self) -> Alm:
@@ -150,19 +155,6 @@ class SameSkies:
         return (
             () if all(np.abs(row - 1.0).max() <= SMALL for row in rows) else tuple(tuple(row.tolist()) for row in rows)
         )
-
-    @cached_property
-    def _before(self) -> dict[tuple[bool, bool, Seen], list[Vector]]:
-        """Return data vectors without any effect, as many as were needed so far.
-
-        Keys are True for constrained skies, for an external simulator, and how the maps were seen that constrain them.
-        """
-        return defaultdict(list)
-
-    @cached_property
-    def _ahead(self) -> dict[tuple[str, int, int, bytes], Matrix]:
-        """Return what was simulated ahead, by all that tells such jobs apart."""
-        return {}
 
     def skies_of(self, effect: config.Effect) -> Skies:
         """Return in which skies the response to an effect is measured.

@@ -192,6 +192,7 @@ class Selection:
     candidates: Sequence[Candidate]
     calibration: Calibration
     settings: DiagnosisSettings
+    _fits: dict[tuple[Subsets, tuple[int, ...]], Fit] = field(default_factory=dict, init=False)
 
     def explanations(self, accepted: Sequence[_Accepted]) -> Iterator[Explanation]:
         """Yield the most probable first; of those that differ only in settings the most probable one."""
@@ -296,10 +297,6 @@ class Selection:
             found = search.null.fit(self.x, self.t[:, columns_of(self.candidates, members)])
             self._fits[search, members] = found
         return self._fits[search, members]
-
-    @cached_property
-    def _fits(self) -> dict[tuple[Subsets, tuple[int, ...]], Fit]:
-        return {}
 
 
 def _without(rows: Rows, accepted: Sequence[tuple[int, ...]]) -> Rows:
