@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import optimize, stats
 
 from mcsim.beamfit.data import EVERYTHING, Measurement, Selection, from_store, with_covariance_of
@@ -18,6 +18,7 @@ from mcsim.config.preparation import frame_of
 from mcsim.ensemble import store
 from mcsim.ensemble.expectation import Source, survey_of
 from mcsim.errors import InputError
+from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.folders import user_path
 
 NEGLIGIBLE = 0.1
@@ -40,8 +41,8 @@ class Fit:
     order: str
     #: offset, design: the expected data are offset + design @ parameters, uK^2: shapes (p,), (p, K); if ``order`` is
     #: "exact", this is their tangent at the best fit
-    offset: NDArray[np.float64]
-    design: NDArray[np.float64]
+    offset: Vector
+    design: Matrix
     solution: Solution  #: parameters, their covariance, chi2, its degrees of freedom and probability
     beyond_leading: float | None = None
     #: of ``orientation`` the second minimum, whose imaginary part has the other sign, if its chi^2 is higher by less
@@ -50,22 +51,22 @@ class Fit:
     each: tuple[Solution, ...] = ()  #: fits of every realization, if made by :func:`fit_each`
 
     @property
-    def best(self) -> NDArray[np.float64]:
+    def best(self) -> Vector:
         """Return the data expected at the best fit, uK^2, shape (p,)."""
         return self.offset + self.design @ self.solution.parameters
 
     @property
-    def ell(self) -> NDArray[np.float64]:
+    def ell(self) -> Vector:
         """Return all multipoles between the first and the last of the data."""
         return np.arange(min(row.ell_min for row in self.measured.rows), self.measured.lmax + 1.0)
 
-    def factor(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def factor(self) -> tuple[Vector, Vector]:
         """Return f_l at :attr:`ell` and its standard deviation; of ``orientation`` the real part."""
         functions = self.model.functions(self.ell).real
         width = np.sqrt(np.einsum("kl,km,ml->l", functions, self.solution.covariance, functions))
         return self.solution.parameters @ functions, width
 
-    def pulls(self, truth: ArrayLike) -> NDArray[np.float64]:
+    def pulls(self, truth: ArrayLike) -> Matrix:
         """Return (estimate - truth)/error of every realization and parameter, shape (N, K)."""
         return np.array([(one.parameters - np.asarray(truth)) / one.errors for one in self.each])
 
@@ -73,7 +74,7 @@ class Fit:
         """Return plain numbers, for JSON."""
         solution = self.solution
 
-        def named(values: NDArray[np.float64]) -> dict[str, float]:
+        def named(values: Vector) -> dict[str, float]:
             return dict(zip(self.model.parameters, values.tolist(), strict=True))
 
         result: dict[str, Any] = {
@@ -190,13 +191,11 @@ def fit_models(
     return fits
 
 
-def _solve(measured: Measurement, offset: NDArray[np.float64], design: NDArray[np.float64]) -> Solution:
+def _solve(measured: Measurement, offset: Vector, design: Matrix) -> Solution:
     return solve(measured.value - offset, design, measured.covariance, measured.simulations)
 
 
-def _minima(
-    measured: Measurement, expected: Polynomial, start: NDArray[np.float64], mirrored: bool
-) -> list[NDArray[np.float64]]:
+def _minima(measured: Measurement, expected: Polynomial, start: Vector, mirrored: bool) -> list[Vector]:
     """Return the parameters at which chi^2 has a minimum, the lowest first.
 
     ``mirrored``: of a complex factor there may be two, of either sign of the imaginary part. The search begins where
@@ -211,16 +210,14 @@ def _minima(
     return [best] if abs(best[1] - other[1]) < SAME else [best, other]
 
 
-def _minimise(
-    measured: Measurement, expected: Polynomial, start: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
+def _minimise(measured: Measurement, expected: Polynomial, start: Vector) -> tuple[Vector, float]:
     """Return the parameters at a minimum of chi^2, and half of the value there."""
     white = whitening(measured.value, expected.linear, measured.covariance, measured.simulations)
 
-    def residual(theta: NDArray[np.float64]) -> NDArray[np.float64]:
+    def residual(theta: Vector) -> Vector:
         return np.asarray(white @ (measured.value - expected.at(theta)))
 
-    def slope(theta: NDArray[np.float64]) -> NDArray[np.float64]:
+    def slope(theta: Vector) -> Matrix:
         return np.asarray(-white @ expected.derivative(theta))
 
     limits = {"xtol": 1e-13, "ftol": 1e-13, "gtol": 1e-13}
@@ -273,7 +270,7 @@ def _with_covariance_of(measured: Measurement, path: str | Path, pair: str | Non
     return with_covariance_of(measured, path, pair)
 
 
-def _unseen(design: NDArray[np.float64], measured: Measurement) -> bool:
+def _unseen(design: Matrix, measured: Measurement) -> bool:
     """Return True if the data do not constrain the imaginary part: its template is under 1e-6 of the real one."""
     real, imaginary = np.linalg.norm(design / np.sqrt(np.diag(measured.covariance))[:, None], axis=0)
     return bool(imaginary < 1e-6 * real)

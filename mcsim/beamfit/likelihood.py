@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 
 from mcsim.errors import InputError
 from mcsim.stats import gaussian
+from mcsim.support.arrays import Matrix, Vector
 
 
 @dataclass(frozen=True)
@@ -16,23 +16,23 @@ class Solution:
     """Best fit of data = design @ parameters."""
 
     #: parameters, covariance: estimates and the covariance of their distribution about the truth, shape (K,) and (K, K)
-    parameters: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    parameters: Vector
+    covariance: Matrix
     #: square, dof, probability: r'C^-1 r of the residual r with the given covariance C, the number of data minus K, and
     #: the p-value: the probability of a square at least as large if the model is true
     square: float
     dof: int
     probability: float
-    residual: NDArray[np.float64]  #: data minus best fit, shape (p,)
+    residual: Vector  #: data minus best fit, shape (p,)
     simulations: int | None  #: number of simulations that C was estimated from; ``None``: C is known
 
     @property
-    def errors(self) -> NDArray[np.float64]:
+    def errors(self) -> Vector:
         """Standard deviations of the parameters, shape (K,)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
-    def correlation(self) -> NDArray[np.float64]:
+    def correlation(self) -> Matrix:
         """Correlation of the parameters, shape (K, K)."""
         return self.covariance / np.outer(self.errors, self.errors)
 
@@ -50,12 +50,7 @@ class Solution:
         return self.chi2 / self.dof
 
 
-def solve(
-    data: NDArray[np.float64],
-    design: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    simulations: int | None = None,
-) -> Solution:
+def solve(data: Vector, design: Matrix, covariance: Matrix, simulations: int | None = None) -> Solution:
     """Fit templates, the columns of ``design``, shape (p, K), to data, shape (p,), by generalised least squares.
 
     The design has rank K < p. With ``simulations`` the covariance, shape (p, p), is proportional to the sample
@@ -91,9 +86,7 @@ def solve(
     return Solution(parameters, spread, square, q, probability, data - design @ parameters, simulations)
 
 
-def whitening(
-    data: NDArray[np.float64], design: NDArray[np.float64], covariance: NDArray[np.float64], simulations: int | None
-) -> NDArray[np.float64]:
+def whitening(data: Vector, design: Matrix, covariance: Matrix, simulations: int | None) -> Matrix:
     """Check the arguments of :func:`solve`; return the inverse Cholesky factor of the covariance, shape (p, p)."""
     p, K = design.shape
     if data.shape != (p,) or covariance.shape != (p, p):
@@ -123,7 +116,7 @@ def whitening(
     return solve_triangular(root, np.diag(1.0 / scale), lower=True)
 
 
-def size(change: NDArray[np.float64], covariance: NDArray[np.float64], simulations: int | None) -> float:
+def size(change: Vector, covariance: Matrix, simulations: int | None) -> float:
     """Return the length of a change of the data, shape (p,), in sigma: no parameter shifts by more of its errors."""
     white = whitening(change, np.zeros((len(change), 0)), covariance, simulations) @ change
     n = np.inf if simulations is None else simulations - 1.0
@@ -166,7 +159,7 @@ def compare(small: Solution, large: Solution) -> Comparison:
     return Comparison((n - small.dof + 1) * drop / (n + large.square), added, probability)
 
 
-def solve_each(realizations: NDArray[np.float64], design: NDArray[np.float64]) -> list[Solution]:
+def solve_each(realizations: Matrix, design: Matrix) -> list[Solution]:
     """Fit every realization, shape (N, p), with the covariance of all the others, which is independent of it."""
     count = len(realizations)
     deviation = realizations - realizations.mean(axis=0)

@@ -33,10 +33,10 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix
 from mcsim.sphere.checks import UNSEEN_BELOW, check_map, check_not_infinite
 from mcsim.support import resources
-from mcsim.support.arrays import Alm, reals
+from mcsim.support.arrays import Alm, Map, reals
 from mcsim.systematics.base import Pointing
 
-Given = Sequence[NDArray[np.float64]] | Mapping[str, NDArray[np.float64]]
+Given = Sequence[Map] | Mapping[str, Map]
 """Maps as arrays, in the order of a run's or by name."""
 
 HELD = 20_000_000  #: the same of samples in files, which are held in memory
@@ -218,7 +218,7 @@ def _groups(run: config.RunConfig) -> dict[str, list[str]]:
     return {channel.name: [one.name for one in run.each_map if one.channel is channel] for channel in run.channels}
 
 
-def _in_order(side: Given, names: Sequence[str]) -> Sequence[NDArray[np.float64]]:
+def _in_order(side: Given, names: Sequence[str]) -> Sequence[Map]:
     """Return the maps of a side, plain numbers with UNSEEN for masked ones, in the order of the names."""
     if isinstance(side, Mapping):
         if set(side) != set(names):
@@ -252,9 +252,7 @@ def _model(
     return run, str(found), model is None and found == own[1] != own[0]
 
 
-def _side(
-    side: str | Path, run: config.RunConfig | None, described: str, nthreads: int
-) -> dict[str, NDArray[np.float64]]:
+def _side(side: str | Path, run: config.RunConfig | None, described: str, nthreads: int) -> dict[str, Map]:
     """Return the maps of a side by name, uK; ``described`` is the model's name in messages."""
     path = Path(side)
     if path.is_dir():
@@ -281,7 +279,7 @@ def _named(side: str | Path) -> tuple[config.RunConfig, str | None]:
     return replace(run, channels=tuple(channel.without_noise() for channel in run.channels)), external
 
 
-def _external(own: config.RunConfig, given: str, nthreads: int) -> dict[str, NDArray[np.float64]]:
+def _external(own: config.RunConfig, given: str, nthreads: int) -> dict[str, Map]:
     """Return the first stored maps of another program, or those that its simulator makes of the run's sky."""
     source, sky = source_of(own, given), None
     if source.count is None:
@@ -294,9 +292,7 @@ def _external(own: config.RunConfig, given: str, nthreads: int) -> dict[str, NDA
     return dict(zip(config.map_names(own), source.maps(own.ensemble.seed, 0, sky=sky), strict=True))
 
 
-def _closer(
-    made: dict[str, NDArray[np.float64]], wanted: dict[str, NDArray[np.float64]], side: str | Path, nthreads: int
-) -> dict[str, NDArray[np.float64]]:
+def _closer(made: dict[str, Map], wanted: dict[str, Map], side: str | Path, nthreads: int) -> dict[str, Map]:
     """Return the maps of a run as they were made, or those that are closer to the other side's, but for a factor.
 
     Orientation moments spread samples over their pixels otherwise than another simulator does, which may have all
@@ -314,7 +310,7 @@ def _closer(
         exact = _by_samples(one, nthreads)
         ways += [] if exact is None else [exact]
 
-    def distance(maps: dict[str, NDArray[np.float64]]) -> float:
+    def distance(maps: dict[str, Map]) -> float:
         total = 0.0
         for name in maps.keys() & wanted.keys():
             there = wanted[name]
@@ -328,7 +324,7 @@ def _closer(
     return min(ways, key=distance)
 
 
-def _by_samples(run: config.RunConfig, nthreads: int) -> dict[str, NDArray[np.float64]] | None:
+def _by_samples(run: config.RunConfig, nthreads: int) -> dict[str, Map] | None:
     """Return the maps of a run sample by sample; None if samples are not known, too many, or not all."""
     whole = survey(run, nthreads)
     pointings = [channel.site.pointing for channel in whole.making.channels]
@@ -340,7 +336,7 @@ def _by_samples(run: config.RunConfig, nthreads: int) -> dict[str, NDArray[np.fl
         return None
 
 
-def _folder(folder: Path, run: config.RunConfig | None, described: str) -> dict[str, NDArray[np.float64]]:
+def _folder(folder: Path, run: config.RunConfig | None, described: str) -> dict[str, Map]:
     folder = first_realization(folder)
     names = {path.stem: path for path in sorted(folder.glob("*.fits"))}
     frequencies: dict[str, float | None] = {}
@@ -364,7 +360,7 @@ def _folder(folder: Path, run: config.RunConfig | None, described: str) -> dict[
     return found
 
 
-def _without_holes(map_uk: NDArray[np.float64]) -> NDArray[np.float64]:
+def _without_holes(map_uk: Map) -> Map:
     """Return a map with UNSEEN for whatever stands for a pixel without data: NaN, UNSEEN in any unit, zeros.
 
     Two pixels of a simulated sky are not exactly 0.
@@ -376,7 +372,7 @@ def _without_holes(map_uk: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(known, map_uk, healpy.UNSEEN)
 
 
-def _checked(map_uk: NDArray[np.float64], name: str) -> int:
+def _checked(map_uk: Map, name: str) -> int:
     """Return nside of a map; raise InputError if that is none, or if pixels are infinite."""
     nside = check_map(map_uk, name=name)
     check_not_infinite(map_uk, name)
@@ -384,7 +380,7 @@ def _checked(map_uk: NDArray[np.float64], name: str) -> int:
 
 
 def _pair(
-    name: str, maps: Sequence[str], sides: Sequence[dict[str, NDArray[np.float64]]], whole: Survey | None, nthreads: int
+    name: str, maps: Sequence[str], sides: Sequence[dict[str, Map]], whole: Survey | None, nthreads: int
 ) -> ChannelPair:
     absent = tuple(m for m in maps if not all(m in side for side in sides))
     labelled = tuple(zip("AB", sides, strict=True))

@@ -35,7 +35,7 @@ from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
-from mcsim.support.arrays import Alm, Cl, Map, divided
+from mcsim.support.arrays import Alm, Cl, Map, Matrix, divided
 
 FAINT = 0.1
 """Power of the sky over that of the noise at the last degree of the filters; what is above adds below 1 % to sigmas."""
@@ -98,7 +98,7 @@ class Model:
     lmax: int  # highest degree of the sky and the matched filters: _highest_degree
     nside: int
     cl: Cl  # spectrum of the sky, uK^2
-    response: NDArray[np.float64]  # B_l w_l of every channel, (channel, lmax + 1)
+    response: Matrix  # B_l w_l of every channel, (channel, lmax + 1)
     parts: tuple[Part, ...]  # the maps in order
     dipole: Alm  # that the survey sees besides, up to lmax, uK
     #: of all maps, if they lack a part of the sky, or of their mean, if pooled; None, and of maps whose noise is not
@@ -267,9 +267,7 @@ def _has_white_noise(m: SurveyMap) -> bool:
     return m.drawn is None and m.pairs is None and (m.preparation is None or not m.preparation.transforms)
 
 
-def inverse_of(
-    cl: Cl, response: NDArray[np.float64], parts: Sequence[Part], offsets: bool = False
-) -> InverseCovariance:
+def inverse_of(cl: Cl, response: Matrix, parts: Sequence[Part], offsets: bool = False) -> InverseCovariance:
     """Return the inverse covariance of all maps, of the circular parts of their beams.
 
     They are those at the centres of pixels, or, with ``offsets``, at the means of their samples.

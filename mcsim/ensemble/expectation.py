@@ -29,7 +29,7 @@ from mcsim.simulation.channels import refuse_unseen
 from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
-from mcsim.support.arrays import divided
+from mcsim.support.arrays import Cl, Map, divided
 
 Source = str | Path | Mapping[str, Any] | config.RunConfig | Survey
 
@@ -87,7 +87,7 @@ def scanned_beams(survey: Survey, L_max: int, nthreads: int = 1) -> tuple[Scanne
     )
 
 
-def nearer(survey: Survey, channel: Channel) -> NDArray[np.float64]:
+def nearer(survey: Survey, channel: Channel) -> Cl:
     """Return the factor of the pixel window of samples that stand nearer to the centres, shape (lmax + 1,).
 
     That of a preparation, which is in the window of the channel too, is not of samples and stays.
@@ -179,13 +179,13 @@ def moments_needed(survey: Survey, exact: bool, L_moments: int | None = None) ->
     return max((_degrees_of(weight) for weight in weights if weight is not None), default=L_MOMENTS)
 
 
-def _degrees_of(weight: NDArray[np.float64]) -> int:
+def _degrees_of(weight: Map) -> int:
     """Return the first of ``L_WEIGHTS`` up to which a weight has nearly all of its square."""
     share = held(weight, L_WEIGHTS[-1])
     return next((L for L in L_WEIGHTS if share[L] >= SHARE), L_WEIGHTS[-1])
 
 
-def held(weight: NDArray[np.float64], L_max: int) -> NDArray[np.float64]:
+def held(weight: Map, L_max: int) -> Cl:
     """Return the share of the mean square of weights in degrees up to 0, 1, ..., L_max."""
     power = np.sum(np.abs(map_harmonics(weight, L_max)) ** 2, axis=1) / (4.0 * np.pi)
     return np.asarray(np.cumsum(power) / np.mean(weight**2))
@@ -230,7 +230,7 @@ def means(
     return Means(seen, circular, noise)
 
 
-def spectrum(survey: Survey) -> NDArray[np.float64]:
+def spectrum(survey: Survey) -> Cl:
     """Return C_l of the sky; raise InputError for a survey without a spectrum."""
     if survey.cl is None:
         raise InputError(
@@ -270,7 +270,7 @@ def noise_mean(survey: Survey, number: int, modes: Sequence[Indices], nthreads: 
 
 
 def _of_steps_in_harmonics(
-    survey: Survey, m: SurveyMap, variance: NDArray[np.float64], modes: Sequence[Indices], nthreads: int
+    survey: Survey, m: SurveyMap, variance: Map, modes: Sequence[Indices], nthreads: int
 ) -> NDArray[np.complex128]:
     """Return the BipoSH of noise of a variance (uK^2) that steps in harmonics have left correlated, windows included.
 
@@ -300,7 +300,7 @@ def _of_steps_in_harmonics(
     return cmb_biposh_leading(modes, power[weight != 0.0].mean() * window**2, lmax, even, nthreads=nthreads)
 
 
-def _check_folded(m: SurveyMap, window: NDArray[np.float64], lmax: int) -> None:
+def _check_folded(m: SurveyMap, window: Cl, lmax: int) -> None:
     """Raise InputError for filtered noise that goes on beyond the degrees of the pixels that it is averaged in."""
     end, ell = 3 * m.moments.nside - 1, np.arange(window.size)
     beyond = float(np.sum(((2 * ell + 1) * window**2)[end + 1 :])) / (12 * m.moments.nside**2)
@@ -312,9 +312,7 @@ def _check_folded(m: SurveyMap, window: NDArray[np.float64], lmax: int) -> None:
         )
 
 
-def _check_even(
-    m: SurveyMap, power: NDArray[np.float64], window: NDArray[np.float64], weight: NDArray[np.float64]
-) -> None:
+def _check_even(m: SurveyMap, power: Map, window: Cl, weight: Map) -> None:
     """Raise InputError for noise that filters do not leave even where the weights after them are, or masks between."""
     assert m.preparation is not None  # the caller looked
     masked = f"map {m.name} is masked after a step in harmonics"

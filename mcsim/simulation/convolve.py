@@ -18,7 +18,7 @@ from mcsim.instrument.scan import Moments
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.checks import check_alm, check_cl, check_nside, check_shape
-from mcsim.support.arrays import Map
+from mcsim.support.arrays import Alm, Cl, Map, Maps
 from mcsim.support.compiled import njit
 
 
@@ -39,7 +39,7 @@ class Response:
         return self.factors.shape[0] - 1
 
 
-def response(beam: Beam, lmax: int, window: NDArray[np.float64] | None = None) -> Response:
+def response(beam: Beam, lmax: int, window: Cl | None = None) -> Response:
     """Return the response of a beam times a pixel window, shape (>= lmax + 1,); InputError if one ends before lmax."""
     if beam.lmax < lmax:
         raise InputError(f"the beam ends at l = {beam.lmax}, below the lmax {lmax} of the sky; compute it further.")
@@ -50,12 +50,12 @@ def response(beam: Beam, lmax: int, window: NDArray[np.float64] | None = None) -
     return Response(k * beam.blm[:, : lmax + 1])
 
 
-def circular_alm(alm: NDArray[np.complex128], response: Response) -> NDArray[np.complex128]:
+def circular_alm(alm: Alm, response: Response) -> Alm:
     """Return the coefficients of the sky seen through the circular part of the beam, shape as ``alm``."""
     return alm_.multiply(alm, response.factors[0].real, response.lmax)
 
 
-def circular_map(alm: NDArray[np.complex128], response: Response, nside: int, nthreads: int = 1) -> Map:
+def circular_map(alm: Alm, response: Response, nside: int, nthreads: int = 1) -> Map:
     """Return S_0, the sky through the circular part of the beam at pixel centres, uK, shape (npix,)."""
     return healpix.synthesis(circular_alm(alm, response)[None], nside, response.lmax, nthreads=nthreads)[0]
 
@@ -66,20 +66,18 @@ class CircularMaps:
     def __init__(self, nside: int, lmax: int, nthreads: int = 1) -> None:
         self._grid = (nside, lmax)
         self.nthreads = nthreads
-        self._alm: NDArray[np.complex128] | None = None
-        self._made: dict[str, NDArray[np.float64]] = {}
+        self._alm: Alm | None = None
+        self._made: dict[str, Maps] = {}
 
-    def map(self, alm: NDArray[np.complex128]) -> Map:
+    def map(self, alm: Alm) -> Map:
         """Return the sky at pixel centres, uK, shape (npix,); read-only."""
         return self._once(alm, "map", lambda: healpix.synthesis(alm[None], *self._grid, nthreads=self.nthreads)[0])
 
-    def gradient(self, alm: NDArray[np.complex128]) -> NDArray[np.float64]:
+    def gradient(self, alm: Alm) -> Maps:
         """Return its gradient as :func:`mcsim.sphere.healpix.gradient` does, uK/rad, shape (2, npix); read-only."""
         return self._once(alm, "gradient", lambda: healpix.gradient(alm, *self._grid, self.nthreads))
 
-    def _once(
-        self, alm: NDArray[np.complex128], name: str, make: Callable[[], NDArray[np.float64]]
-    ) -> NDArray[np.float64]:
+    def _once(self, alm: Alm, name: str, make: Callable[[], Maps]) -> Maps:
         if self._alm is None or not np.array_equal(self._alm, alm):
             self._alm, self._made = alm, {}
         if name not in self._made:
@@ -89,8 +87,8 @@ class CircularMaps:
 
 
 def spin_maps(
-    alm: NDArray[np.complex128], response: Response, nside: int, nthreads: int = 1, rings: slice | None = None
-) -> dict[int, NDArray[np.float64]]:
+    alm: Alm, response: Response, nside: int, nthreads: int = 1, rings: slice | None = None
+) -> dict[int, Maps]:
     """Return S_s at pixel centres for every s > 0 that the beam has: real and imaginary parts, shape (2, npix), in uK.
 
     ``rings``: of these rings alone.
@@ -114,7 +112,7 @@ def spin_maps(
     return maps
 
 
-def noncircular_map(maps: dict[int, NDArray[np.float64]], moments: Moments) -> Map:
+def noncircular_map(maps: dict[int, Maps], moments: Moments) -> Map:
     """Return 2 Re sum_{s > 0} w_s S_s, what the non-circular part of the beam adds under a scan, uK, shape (npix,).
 
     InputError if the moments have fewer orders than the maps, or another nside.
@@ -139,9 +137,7 @@ def add_twice_real_part(w, real, imag, total):  # type: ignore[no-untyped-def]
         total[pixel] += 2.0 * (w[pixel].real * real[pixel] - w[pixel].imag * imag[pixel])
 
 
-def turned(
-    each: Sequence[tuple[Map, Moments]], s: int, total: NDArray[np.float64] | None = None
-) -> NDArray[np.float64]:
+def turned(each: Sequence[tuple[Map, Moments]], s: int, total: Maps | None = None) -> Maps:
     """Return the sum of conj(w_s) times maps, real and imaginary part, shape (2, npix): adjoint to w_s S_s.
 
     ``total``: an array of this shape to fill, in place of a new one.
@@ -162,7 +158,7 @@ def _turn(map_, w, total, first):  # type: ignore[no-untyped-def]
         total[1, pixel] = -imag if first else total[1, pixel] - imag
 
 
-def centroid_map(gradient: NDArray[np.float64], moments: Moments) -> Map:
+def centroid_map(gradient: Maps, moments: Moments) -> Map:
     """Return d . grad S_0 for samples whose mean position is off the pixel centre by d, uK, shape (npix,).
 
     The gradient is d/dtheta and 1/sin(theta) d/dphi of S_0, shape (2, npix), uK/rad; d is the moments'.

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.errors import RunError
@@ -13,7 +12,7 @@ from mcsim.simulation.channels import scan_model
 from mcsim.simulation.survey import Channel, SideB, SurveyMap
 from mcsim.sphere import rng
 from mcsim.sphere.sky import dipole_alm
-from mcsim.support.arrays import Map
+from mcsim.support.arrays import Alm, Map, Maps
 
 Sides = tuple[mapmaking.SideMaps, mapmaking.SideMaps]
 
@@ -51,12 +50,7 @@ def seconds(run: config.RunConfig) -> float:
 
 
 def maps(
-    channel: Channel,
-    sky: NDArray[np.complex128],
-    dipole: NDArray[np.complex128] | None,
-    seed: int,
-    realization: int,
-    nthreads: int = 1,
+    channel: Channel, sky: Alm, dipole: Alm | None, seed: int, realization: int, nthreads: int = 1
 ) -> Iterator[tuple[SurveyMap, Map, Map]]:
     """Yield the maps of a differencing channel, in two parts, for every split of its survey.
 
@@ -86,12 +80,7 @@ def maps(
 
 
 def whole_maps(
-    channel: Channel,
-    sky: NDArray[np.complex128],
-    dipole: NDArray[np.complex128] | None,
-    seed: int,
-    realization: int,
-    nthreads: int = 1,
+    channel: Channel, sky: Alm, dipole: Alm | None, seed: int, realization: int, nthreads: int = 1
 ) -> Iterator[tuple[SurveyMap, Map]]:
     """Yield the sums of the two parts of :func:`maps`, solved for at once, in about half of the time.
 
@@ -124,7 +113,7 @@ def not_converged(channel: Channel, m: SurveyMap, sky_uk: Map) -> Map:
     return np.where(seen, mapmaking.solve(_pairs(m), rhs, x, rule)[0] - map_uk, 0.0)
 
 
-def iterations_to_spare(channel: Channel, sky: NDArray[np.complex128]) -> int:
+def iterations_to_spare(channel: Channel, sky: Alm) -> int:
     """Return how many iterations more than FEW the first map of a sky takes to converge, >= 1."""
     scan, m = _side_b(channel).scan, channel.maps[0]
     x, rule = scan.transmission_imbalance, mapmaking.StoppingRule(scan.tolerance, scan.max_iterations)
@@ -143,7 +132,7 @@ def _pairs(m: SurveyMap) -> mapmaking.DifferencingScan:
     return m.pairs
 
 
-def _side_maps(channel: Channel, sky: NDArray[np.complex128], nthreads: int) -> Sides:
+def _side_maps(channel: Channel, sky: Alm, nthreads: int) -> Sides:
     a, b = channel.response, _side_b(channel).response
     return mapmaking.side_maps(sky, a, channel.site.nside, nthreads), mapmaking.side_maps(
         sky, b, channel.site.nside, nthreads
@@ -161,8 +150,8 @@ def _mean(sides: Sides) -> Map:
 
 
 def _rhs(
-    channel: Channel, skies: list[Sides], dipole: NDArray[np.complex128] | None, draw: tuple[int, int], nthreads: int
-) -> Iterator[tuple[SurveyMap, NDArray[np.float64]]]:
+    channel: Channel, skies: list[Sides], dipole: Alm | None, draw: tuple[int, int], nthreads: int
+) -> Iterator[tuple[SurveyMap, Maps]]:
     """Yield every map with its right-hand sides, shape (skies, npix); ``draw`` has seed and realization.
 
     ``skies``: through the whole beams, and before that, if at all, through their circular parts.

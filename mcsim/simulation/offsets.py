@@ -15,14 +15,13 @@ from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim.bipolar.theory.harmonics import spin_functions
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
-from mcsim.support.arrays import Alm
+from mcsim.support.arrays import Alm, Cl, Map, Maps, Vector
 
 
 class Expansion:
@@ -40,13 +39,13 @@ class Expansion:
         Mean of rho^n, by n = 2, 4.
     """
 
-    def __init__(self, r: NDArray[np.float64], weight: NDArray[np.float64], lmax: int, order: int) -> None:
+    def __init__(self, r: Vector, weight: Vector, lmax: int, order: int) -> None:
         self.order = order
         rho, root = np.sin(r), np.sqrt(weight)
         functions = spin_functions(order, lmax, r) / np.sqrt((2 * np.arange(lmax + 1) + 1) / (4 * np.pi))[:, None]
         self.smooth = functions[0] @ weight
         self.means = {n: float(weight @ rho**n) for n in range(2, order + 1, 2)}
-        self.windows: dict[tuple[int, int], NDArray[np.float64]] = {}
+        self.windows: dict[tuple[int, int], Cl] = {}
         for s in range(min(order, lmax) + 1):  # sY_lm begins at l = s
             powers = [n for n in range(s, order + 1, 2) if n]
             wanted = functions[s] - self.smooth[:, None] if s == 0 else functions[s]
@@ -68,9 +67,7 @@ def transforms(order: int) -> int:
     return sum(1 if s == 0 else 2 for s in range(order + 1) for n in range(s, order + 1, 2) if n)
 
 
-def offset_maps(
-    circular: Alm, terms: Expansion, moments: Sequence[Moments], nthreads: int = 1
-) -> list[NDArray[np.float64]]:
+def offset_maps(circular: Alm, terms: Expansion, moments: Sequence[Moments], nthreads: int = 1) -> list[Map]:
     """Return what the samples' offsets add to S_0 through ``terms.smooth``, uK, shape (npix,), for each scan.
 
     ``circular``: the sky through the circular part of the beam, without a pixel window. Every scan needs moments of
@@ -87,9 +84,7 @@ def offset_maps(
     return found
 
 
-def _transforms(
-    circular: Alm, terms: Expansion, nside: int, nthreads: int
-) -> Iterator[tuple[int, int, NDArray[np.float64]]]:
+def _transforms(circular: Alm, terms: Expansion, nside: int, nthreads: int) -> Iterator[tuple[int, int, Maps]]:
     lmax = alm_.lmax_of(circular.size) or 0
     for (s, n), window in terms.windows.items():
         # ducc0 returns minus the sum over sY_lm from E alone.

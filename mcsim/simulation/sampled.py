@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import healpy
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim import config, systematics
 from mcsim.errors import InputError
@@ -20,9 +19,7 @@ EPSILON = 1e-7
 """Accuracy asked of the interpolation, relative to sky and dipole together: 0.3 nK. 1e-9 takes half as long again."""
 
 
-def maps(
-    survey: Survey, realization: int, nthreads: int = 1, epsilon: float = EPSILON
-) -> list[tuple[str, NDArray[np.float64]]]:
+def maps(survey: Survey, realization: int, nthreads: int = 1, epsilon: float = EPSILON) -> list[tuple[str, Map]]:
     """Return names and maps of one realization, each the plain mean of its samples, in the order of the survey's.
 
     The maps are in uK, shape (npix,), ``healpy.UNSEEN`` where nothing was observed. The sky and what effects draw are

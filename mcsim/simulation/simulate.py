@@ -16,7 +16,7 @@ from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng
 from mcsim.sphere.sky import dipole_alm, gaussian_alm
-from mcsim.support.arrays import Alm, divided
+from mcsim.support.arrays import Alm, Map, Maps, divided
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Observed:
 
     alm: Alm
     circular: Alm | None
-    map_uk: NDArray[np.float64] | None
+    map_uk: Map | None
 
 
 def realize(survey: Survey, realization: int, nthreads: int = 1) -> dict[str, NDArray]:
@@ -55,7 +55,7 @@ def draw_sky(survey: Survey, realization: int) -> Alm:
     return gaussian_alm(survey.cl, rng.generator(survey.config.ensemble.seed, realization, "sky"))
 
 
-def maps(survey: Survey, realization: int, nthreads: int = 1, sky: Alm | None = None) -> NDArray[np.float64]:
+def maps(survey: Survey, realization: int, nthreads: int = 1, sky: Alm | None = None) -> Maps:
     """Return the maps of one realization with effects and noise, uK, shape (map, npix), ``healpy.UNSEEN`` without hits.
 
     They are prepared where the run says how.
@@ -68,9 +68,7 @@ def maps(survey: Survey, realization: int, nthreads: int = 1, sky: Alm | None = 
     return np.stack([m for one in survey.making.channels for m in maps_of(survey, one, sky, realization, made)])
 
 
-def maps_of(
-    survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps
-) -> list[NDArray[np.float64]]:
+def maps_of(survey: Survey, channel: Channel, sky: Alm, realization: int, made: convolve.CircularMaps) -> list[Map]:
     """Return the maps of one channel of :attr:`Survey.making`, as :func:`maps` does; ``made``: of other channels."""
     if channel.side_b is not None:
         seen, dipole = _seen(survey.making, channel, sky, realization)
@@ -81,7 +79,7 @@ def maps_of(
     return [_finished(m, own.total) for m, own in parts]
 
 
-def _finished(m: SurveyMap, map_uk: NDArray[np.float64]) -> NDArray[np.float64]:
+def _finished(m: SurveyMap, map_uk: Map) -> Map:
     """Return a map that was made as it is handed out: without what was not observed, and prepared."""
     observed = np.where(m.moments.hits > 0, map_uk, healpy.UNSEEN)
     return observed if m.preparation is None else m.preparation.apply(observed)
@@ -95,13 +93,13 @@ class MapParts:
     """
 
     #: the sky through the circular part of the beam at the pixels' centres; None where its a_lm stand for it
-    smooth: NDArray[np.float64] | None
+    smooth: Map | None
     #: The rest of the circular-beam control: centroids, noise, gain, what effects add to samples. None: nothing.
-    extra: NDArray[np.float64] | None
-    difference: NDArray[np.float64] | None  #: What the rest of the beam adds. None: nothing.
+    extra: Map | None
+    difference: Map | None  #: What the rest of the beam adds. None: nothing.
 
     @property
-    def total(self) -> NDArray[np.float64]:
+    def total(self) -> Map:
         """Sum of the parts."""
         return reduce(np.add, [part for part in (self.smooth, self.extra, self.difference) if part is not None])
 
@@ -202,7 +200,7 @@ def _map_parts(
         whole = convolve.CircularMaps(nside, survey.config.sky.lmax, nthreads)
     gradient = None
     terms = _expansion(channel)
-    offsets: list[NDArray[np.float64]] = []
+    offsets: list[Map] = []
     if terms is not None:
         offsets = offset_maps(_unwindowed(channel, seen, dipole), terms, [m.moments for m in channel.maps], nthreads)
     elif any(m.moments.dtheta is not None for m in channel.maps):
@@ -229,7 +227,7 @@ def _map_parts(
         yield m, MapParts(flat, sum(extra[1:], start=extra[0]) if extra else None, difference)
 
 
-def _gained(channel: Channel, m: SurveyMap, made: convolve.CircularMaps, circular: Alm) -> NDArray[np.float64]:
+def _gained(channel: Channel, m: SurveyMap, made: convolve.CircularMaps, circular: Alm) -> Map:
     """Return what the error of the gain makes of a sky through the circular part of the beam, samples off the centres.
 
     ``circular``: its a_lm; ``made``: its maps, which splits share.
@@ -305,9 +303,7 @@ def _seen(survey: Survey, channel: Channel, sky: Alm, realization: int) -> tuple
     return sky + dipole, dipole
 
 
-def _analyse(
-    survey: Survey, channel: Channel, map_uk: NDArray[np.float64], weight: NDArray[np.float64] | None, nthreads: int
-) -> Alm:
+def _analyse(survey: Survey, channel: Channel, map_uk: Map, weight: Map | None, nthreads: int) -> Alm:
     """Return the coefficients of a weighted map, with the pixel window divided out."""
     weighted = map_uk if weight is None else weight * map_uk
     alm = healpix.analysis(weighted, survey.lmax, survey.config.biposh.iterations, nthreads)

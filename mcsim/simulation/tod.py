@@ -26,7 +26,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import LineOfSight, MapGrid, ScanModel
 from mcsim.instrument.scan.pointing import PointingStream, fill_samples
 from mcsim.sphere.checks import check_alm, check_nside, check_shape
-from mcsim.support.arrays import Map, divided
+from mcsim.support.arrays import Alm, Map, Vector, divided
 from mcsim.support.compiled import njit
 
 CHUNK = 1 << 18
@@ -39,14 +39,14 @@ EPSILON = 1e-10  #: accuracy asked of the interpolation, relative to the signal
 class Samples:
     """Consecutive samples of one line of sight; every array has shape (n,)."""
 
-    time_s: NDArray[np.float64]  #: time since the start of the survey, in seconds
+    time_s: Vector  #: time since the start of the survey, in seconds
     #: theta, phi, psi: direction and orientation of the beam's x axis (from e_theta towards e_phi), in radians, phi in
     #: [0, 2 pi)
-    theta: NDArray[np.float64]
-    phi: NDArray[np.float64]
-    psi: NDArray[np.float64]
+    theta: Vector
+    phi: Vector
+    psi: Vector
     pixel: NDArray[np.int64]  #: RING pixel into which the sample is binned; stages that move the beam leave it alone
-    signal_uk: NDArray[np.float64]  #: what the detector gives, in uK; zero until a stage adds to it
+    signal_uk: Vector  #: what the detector gives, in uK; zero until a stage adds to it
 
 
 Stage = Callable[[Iterable[Samples]], Iterator[Samples]]
@@ -119,9 +119,7 @@ def with_signal(signal: Callable[[Samples], Map]) -> Stage:
     return stage
 
 
-def sky_signal(
-    alm: NDArray[np.complex128], lmax: int, beam: Beam, epsilon: float = EPSILON, nthreads: int = 1
-) -> Stage:
+def sky_signal(alm: Alm, lmax: int, beam: Beam, epsilon: float = EPSILON, nthreads: int = 1) -> Stage:
     """Return a stage that adds the sky seen by a beam at the samples' own directions and orientations.
 
     ``alm`` is in uK and of ``lmax``, up to which the beam must be known; ``epsilon``, 1e-12 to 1e-2, is the relative
@@ -191,7 +189,7 @@ def every_ring(spin_period_s: float, number: int, index: int) -> Stage:
     return stage
 
 
-def on_rings(time_s: NDArray[np.float64], spin_period_s: float, number: int, index: int) -> NDArray[np.bool_]:
+def on_rings(time_s: Vector, spin_period_s: float, number: int, index: int) -> NDArray[np.bool_]:
     """Return True for samples of every ``number``-th ring from ring ``index`` on."""
     return np.asarray(np.floor(time_s / abs(spin_period_s)).astype(np.int64) % number == index)
 

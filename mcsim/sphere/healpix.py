@@ -26,7 +26,7 @@ from mcsim.sphere.checks import (
     nside_of,
 )
 from mcsim.sphere.header import first_table, frame_named, opened, to_uk
-from mcsim.support.arrays import Alm, Map
+from mcsim.support.arrays import Alm, Cl, Map, Maps, Matrix, Vector
 from mcsim.support.code import package_digest
 from mcsim.support.folders import cached, unreadable
 from mcsim.support.npy import read_npy, write_npy
@@ -38,7 +38,7 @@ def geometry(nside: int) -> dict[str, Any]:
     return dict(ducc0.healpix.Healpix_Base(nside, "RING").sht_info())
 
 
-def centres(nside: int) -> NDArray[np.float64]:
+def centres(nside: int) -> Matrix:
     """Return the unit vectors of the centres of all pixels in RING order, shape (3, npix)."""
     return np.stack(healpy.pix2vec(nside, np.arange(12 * nside**2)))
 
@@ -50,9 +50,7 @@ def rings_between(nside: int, north: float, south: float) -> slice:
     return slice(max(int(first) - 2, 0), min(int(last) + 2, theta.size))
 
 
-def synthesis(
-    alm: Alm, nside: int, lmax: int, spin: int = 0, nthreads: int = 1, rings: slice | None = None
-) -> NDArray[np.float64]:
+def synthesis(alm: Alm, nside: int, lmax: int, spin: int = 0, nthreads: int = 1, rings: slice | None = None) -> Maps:
     """Return the map of a_lm: (1, npix) from (1, size) at spin 0, else (2, npix) from E and B (2, size).
 
     ``rings``: make these alone, one after the other, as :func:`rings_between` gives them.
@@ -67,7 +65,7 @@ def synthesis(
     return np.asarray(ducc0.sht.synthesis(alm=alm, spin=spin, lmax=lmax, nthreads=nthreads, **where))
 
 
-def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.float64]:
+def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> Maps:
     """Return (d/dtheta, 1/sin(theta) d/dphi), shape (2, npix), of the spin-0 map of a_lm of shape (size,).
 
     Notes
@@ -84,7 +82,7 @@ def gradient(alm: Alm, nside: int, lmax: int, nthreads: int = 1) -> NDArray[np.f
     return synthesis(electric_magnetic, nside, lmax, 1, nthreads)
 
 
-def adjoint(map_: NDArray[np.float64], lmax: int, nthreads: int = 1, spin: int = 0) -> Alm:
+def adjoint(map_: Maps, lmax: int, nthreads: int = 1, spin: int = 0) -> Alm:
     """Return the adjoint of the synthesis: the sum over pixels of the map times conj(Y_lm), shape (size,) at spin 0.
 
     At other spins a map of shape (2, npix) gives E and B, shape (2, size).
@@ -136,7 +134,7 @@ def _pixel_weights(nside: int) -> Map:
 
 
 @lru_cache(maxsize=4)
-def pixel_window(nside: int, lmax: int) -> NDArray[np.float64]:
+def pixel_window(nside: int, lmax: int) -> Cl:
     r"""Return the pixel window w_l, computed from the shapes of the pixels and averaged; shape (lmax + 1,).
 
     Notes
@@ -157,7 +155,7 @@ def pixel_window(nside: int, lmax: int) -> NDArray[np.float64]:
     return window
 
 
-def mean_window(nside: int, split: int, lmax: int) -> NDArray[np.float64]:
+def mean_window(nside: int, split: int, lmax: int) -> Cl:
     """Return the window of the mean of split x split sub-pixel centres over pixels, shape (lmax + 1,)."""
     found = [share * _mean_legendre(face, nside, split, lmax) for face, share in _FACES]
     return np.asarray(np.sqrt(np.abs(np.sum(found, axis=0))))
@@ -179,7 +177,7 @@ def _representatives(face: int, nside: int) -> NDArray[np.int64]:
 
 
 @lru_cache(maxsize=4)
-def distances_from_centres(nside: int, split: int = 16) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def distances_from_centres(nside: int, split: int = 16) -> tuple[Vector, Vector]:
     """Return distances of points all over the pixels from their pixels' centres, radians, by a histogram, and shares.
 
     A pixel is sampled at the centres of split x split sub-pixels.
@@ -201,7 +199,7 @@ def distances_from_centres(nside: int, split: int = 16) -> tuple[NDArray[np.floa
 
 
 @lru_cache(maxsize=32)
-def _distances(face: int, nside: int, split: int) -> NDArray[np.float64]:
+def _distances(face: int, nside: int, split: int) -> Matrix:
     """Return the cosines between split x split sub-pixel centres of a face's pixels, and their shares; shape (2, n).
 
     They serve windows up to any lmax. Finding them takes longer than all else at the start of a small run: the cache
@@ -222,7 +220,7 @@ def _distances(face: int, nside: int, split: int) -> NDArray[np.float64]:
     return found
 
 
-def _histogram(face: int, nside: int, split: int) -> NDArray[np.float64]:
+def _histogram(face: int, nside: int, split: int) -> Matrix:
     """Return cosines and shares of :func:`_distances` from a histogram of all distances within a pixel."""
     inside = _representatives(face, nside)[:, None] * split**2 + np.arange(split**2)
     centres = np.stack(healpy.pix2vec(split * nside, inside, nest=True), axis=-1)
@@ -234,7 +232,7 @@ def _histogram(face: int, nside: int, split: int) -> NDArray[np.float64]:
     return np.stack([1.0 - (total[filled] / count[filled]) ** 2 / 2.0, count[filled] / count.sum()])
 
 
-def _mean_legendre(face: int, nside: int, split: int, lmax: int) -> NDArray[np.float64]:
+def _mean_legendre(face: int, nside: int, split: int, lmax: int) -> Cl:
     """Return <P_l(x . y)> over pairs of the split x split sub-pixel centres of a face's pixels, shape (lmax + 1,)."""
     cosine, weight = _distances(face, nside, split)
     before, legendre = np.ones_like(cosine), cosine
@@ -336,7 +334,7 @@ def _column_called(path: Path, names: tuple[str, ...], alone: bool) -> int:
     raise InputError(f"{path} has the columns {', '.join(columns)} and none called {' or '.join(names)}; name it so.")
 
 
-def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> NDArray[np.float64]:
+def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> Cl:
     """Read a temperature pixel window, shape (lmax + 1,), from a HEALPix FITS file or a .npy file.
 
     Raise InputError if the file cannot be read, ends below lmax, states another ``nside``, or is not a window.

@@ -12,11 +12,12 @@ from scipy.linalg import expm
 from mcsim.errors import InputError
 from mcsim.sphere import healpix
 from mcsim.sphere.checks import check_alm, check_map
+from mcsim.support.arrays import Alm, Matrix
 
 FRAMES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
 
 
-def rotation_matrix(frame_from: str, frame_to: str) -> NDArray[np.float64]:
+def rotation_matrix(frame_from: str, frame_to: str) -> Matrix:
     """Return R, shape (3, 3), with (components in ``frame_to``) = R (components in ``frame_from``).
 
     Raise InputError for a frame other than ecliptic, galactic or equatorial.
@@ -30,11 +31,11 @@ def rotation_matrix(frame_from: str, frame_to: str) -> NDArray[np.float64]:
 
 
 @cache
-def _between(frame_from: str, frame_to: str) -> NDArray[np.float64]:
+def _between(frame_from: str, frame_to: str) -> Matrix:
     return np.array(hp.Rotator(coord=[FRAMES[frame_from], FRAMES[frame_to]]).mat)
 
 
-def euler_angles(matrix: NDArray[np.float64]) -> tuple[float, float, float]:
+def euler_angles(matrix: Matrix) -> tuple[float, float, float]:
     """Return (alpha, beta, gamma) in radians with matrix = R_z(alpha) R_y(beta) R_z(gamma)."""
     beta = float(np.arctan2(np.hypot(matrix[0, 2], matrix[1, 2]), matrix[2, 2]))
     if np.hypot(matrix[0, 2], matrix[1, 2]) < 1e-12:
@@ -43,7 +44,7 @@ def euler_angles(matrix: NDArray[np.float64]) -> tuple[float, float, float]:
     return float(np.arctan2(matrix[1, 2], matrix[0, 2])), beta, float(np.arctan2(matrix[2, 1], -matrix[2, 0]))
 
 
-def wigner_D(L: int, matrix: NDArray[np.float64]) -> NDArray[np.complex128]:
+def wigner_D(L: int, matrix: Matrix) -> NDArray[np.complex128]:
     """Return D^L_{MM'} of a rotation, with a'_{LM} = sum_M' D^L_{MM'} a_{LM'}; shape (2L + 1, 2L + 1).
 
     Notes
@@ -63,17 +64,13 @@ def _frame_D(L: int, frame_from: str, frame_to: str) -> NDArray[np.complex128]:
     return wigner_D(L, rotation_matrix(frame_from, frame_to))
 
 
-def rotate_alm(
-    alm: NDArray[np.complex128], lmax: int, frame_from: str, frame_to: str, nthreads: int = 1
-) -> NDArray[np.complex128]:
+def rotate_alm(alm: Alm, lmax: int, frame_from: str, frame_to: str, nthreads: int = 1) -> Alm:
     """Return the a_lm of a real field, shape (size(lmax),), in another frame; InputError for another shape."""
     check_alm(alm, lmax)
     return turn_alm(alm, lmax, rotation_matrix(frame_from, frame_to), nthreads)
 
 
-def turn_alm(
-    alm: NDArray[np.complex128], lmax: int, matrix: NDArray[np.float64], nthreads: int = 1
-) -> NDArray[np.complex128]:
+def turn_alm(alm: Alm, lmax: int, matrix: Matrix, nthreads: int = 1) -> Alm:
     """Return the a_lm of a real field whose directions are multiplied by a rotation matrix."""
     alpha, beta, gamma = euler_angles(matrix)
     return np.asarray(ducc0.sht.rotate_alm(alm, lmax, gamma, beta, alpha, nthreads=nthreads))

@@ -1,8 +1,8 @@
 """Families of Wigner 3j and 6j symbols by the two-sided three-term recursion, compiled."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcsim.support.arrays import Vector
 from mcsim.support.compiled import njit
 
 # Loops stand where numpy's operations on slices would be shorter: numba compiles each of those with its messages about
@@ -18,13 +18,7 @@ def _root(j: float, sum_plus_one: float, difference: float) -> float:
 
 
 @njit(nogil=True)
-def _minimal_at_both_ends(
-    upper: NDArray[np.float64],
-    diagonal: NDArray[np.float64],
-    lower: NDArray[np.float64],
-    n: int,
-    out: NDArray[np.float64],
-) -> None:
+def _minimal_at_both_ends(upper: Vector, diagonal: Vector, lower: Vector, n: int, out: Vector) -> None:
     """Solve upper_i f_{i+1} + diagonal_i f_i + lower_i f_{i-1} = 0, falling off at both ends, up to a factor.
 
     The recursion runs forward to the first decrease and backward from the top, where each is stable. Least squares
@@ -59,7 +53,7 @@ def _minimal_at_both_ends(
 
 
 @njit(nogil=True)
-def _normalise(jmin: int, n: int, factor: float, top_sign: float, out: NDArray[np.float64]) -> None:
+def _normalise(jmin: int, n: int, factor: float, top_sign: float, out: Vector) -> None:
     """Scale to factor sum_j (2j+1) f_j^2 = 1 with the given sign at the top."""
     largest, norm = 0.0, 0.0
     for i in range(n):
@@ -74,7 +68,7 @@ def _normalise(jmin: int, n: int, factor: float, top_sign: float, out: NDArray[n
 
 
 @njit(nogil=True)
-def threej_family(j2: int, j3: int, m2: int, m3: int, out: NDArray[np.float64]) -> tuple[int, int]:
+def threej_family(j2: int, j3: int, m2: int, m3: int, out: Vector) -> tuple[int, int]:
     """Write the 3j symbols (j j2 j3; -m2-m3 m2 m3) for every j to the start of ``out``, |m2| <= j2 and |m3| <= j3.
 
     ``out`` has the shape (>= 2 min(j2, j3) + 1,). Return jmin = max(|j2 - j3|, |m2 + m3|) and their number n:
@@ -106,7 +100,7 @@ def threej_family(j2: int, j3: int, m2: int, m3: int, out: NDArray[np.float64]) 
 
 
 @njit(nogil=True)
-def sixj_family(j2: int, j3: int, j4: int, j5: int, j6: int, out: NDArray[np.float64]) -> tuple[int, int]:
+def sixj_family(j2: int, j3: int, j4: int, j5: int, j6: int, out: Vector) -> tuple[int, int]:
     """Write the 6j symbols {j j2 j3; j4 j5 j6} for every j to the start of ``out``.
 
     The triads (j4, j2, j6) and (j4, j5, j3) satisfy the triangle conditions. ``out`` has the shape

@@ -9,6 +9,7 @@ from scipy import special, stats
 from scipy.optimize import brentq, newton
 
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
+from mcsim.support.arrays import Matrix, Vector
 
 # Nodes of the average over the part of the data outside the span of the templates.
 NODES = 40
@@ -53,9 +54,7 @@ def snr_needed(
     return float(brentq(lambda s: power(s, columns, alpha / tests, dimension, simulations) - target, 0.0, high))
 
 
-def detectable(
-    null: SimulatedGaussian, t: NDArray[np.float64], tests: int, typical: NDArray[np.float64] | None = None
-) -> float:
+def detectable(null: SimulatedGaussian, t: Matrix, tests: int, typical: Matrix | None = None) -> float:
     """Return the smallest amplitude at which a candidate with columns ``t``, shape (p_raw, K), in one unit is detected.
 
     It is that of the root mean square response to ``typical``, coordinates of unit amplitudes, shape (K, j); left out:
@@ -100,7 +99,7 @@ def snr_to_separate(cosine: ArrayLike, target: float = 0.95) -> NDArray[np.float
     return np.where(rho < nearest, root * scale, np.inf)
 
 
-def cosines(candidates: WhitenedTemplates) -> NDArray[np.float64]:
+def cosines(candidates: WhitenedTemplates) -> Matrix:
     """Return the largest canonical correlation of each pair of candidates, shape (C, C); 0 for an empty one."""
     parts = [candidates.basis[:, a:b] for a, b in pairwise(candidates.start)]
     found = np.eye(len(parts))
@@ -138,12 +137,8 @@ def log_evidence(
 
 
 def posterior(
-    null: SimulatedGaussian,
-    x: NDArray[np.float64],
-    candidates: WhitenedTemplates,
-    strengths: NDArray[np.float64],
-    prior: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    null: SimulatedGaussian, x: Matrix, candidates: WhitenedTemplates, strengths: Vector, prior: Vector
+) -> Matrix:
     """Return the posterior probability of none and of each candidate: the Bayes-optimal classifier of a prior.
 
     ``null``, ``x``: distribution of the data vector without an effect, and data, shape (..., p_raw); the result is
@@ -173,12 +168,12 @@ def posterior(
 
 def pair_log_marginals(
     null: SimulatedGaussian,
-    y: NDArray[np.float64],
+    y: Vector,
     groups: WhitenedTemplates,
     pairs: Sequence[tuple[int, int]],
     norms: tuple[float, float],
-    normals: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    normals: Matrix,
+) -> Vector:
     """Return the log marginal likelihood of pairs of groups, shape (pairs,), minus infinity for negligible ones.
 
     White data ``y`` have shape (p,). The white norm s of each effect is uniform in log s within ``norms``, and its
@@ -208,7 +203,7 @@ def pair_log_marginals(
     return found
 
 
-def _log_prior(theta: NDArray[np.float64], norms: tuple[float, float]) -> NDArray[np.float64]:
+def _log_prior(theta: Matrix, norms: tuple[float, float]) -> Vector:
     """Return the log prior density of amplitudes in orthonormal white coordinates, shape (draws, K) to (draws,)."""
     K, s, (low, high) = theta.shape[1], np.linalg.norm(theta, axis=1), norms
     area = np.log(2.0) + 0.5 * K * np.log(np.pi) - special.gammaln(0.5 * K)

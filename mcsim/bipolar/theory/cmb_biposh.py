@@ -16,6 +16,7 @@ from mcsim.bipolar.modes import Indices, bennett_factor, check_modes, existing
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh
 from mcsim.sphere.checks import check_cl, check_shape, check_whole
 from mcsim.sphere.wigner import sixj_family, threej_family
+from mcsim.support.arrays import Cl
 from mcsim.support.compiled import njit
 
 _BLOCK = 32
@@ -25,12 +26,7 @@ _TOLERANCE = 1e-12
 
 
 def cmb_biposh_leading(
-    modes: Sequence[Indices],
-    cl: NDArray[np.float64],
-    lmax: int,
-    x: ScannedBeam,
-    y: ScannedBeam | None = None,
-    nthreads: int = 1,
+    modes: Sequence[Indices], cl: Cl, lmax: int, x: ScannedBeam, y: ScannedBeam | None = None, nthreads: int = 1
 ) -> NDArray[np.complex128]:
     """Return the mean A^{LM}_{l1 l2} of modes (L, M, d), with |M|, |d| <= L, to leading order.
 
@@ -66,12 +62,7 @@ def cmb_biposh_leading(
 
 
 def cmb_biposh_exact(
-    modes: Sequence[Indices],
-    cl: NDArray[np.float64],
-    lmax: int,
-    x: ScannedBeam,
-    y: ScannedBeam | None = None,
-    nthreads: int = 1,
+    modes: Sequence[Indices], cl: Cl, lmax: int, x: ScannedBeam, y: ScannedBeam | None = None, nthreads: int = 1
 ) -> NDArray[np.complex128]:
     """Return the mean A^{LM}_{l1 l2} of modes (L, M, d), with |M|, |d| <= L, to all orders in b_ls.
 
@@ -98,13 +89,7 @@ def cmb_biposh_exact(
 
 
 def _summed(
-    modes: Sequence[Indices],
-    cl: NDArray[np.float64],
-    lmax: int,
-    x: ScannedBeam,
-    y: ScannedBeam,
-    nthreads: int,
-    leading: bool = False,
+    modes: Sequence[Indices], cl: Cl, lmax: int, x: ScannedBeam, y: ScannedBeam, nthreads: int, leading: bool = False
 ) -> NDArray[np.complex128]:
     """Return the sum over L1, L2 of :func:`cmb_biposh_exact`; ``leading``: without products of non-circular parts."""
     result = np.full((len(modes), lmax + 1), np.nan, dtype=np.complex128)
@@ -160,7 +145,7 @@ def noise_biposh(modes: Sequence[Indices], variance: NDArray[np.complex128], lma
 
 
 def _checked(
-    modes: Sequence[Indices], cl: NDArray[np.float64], lmax: int, x: ScannedBeam, y: ScannedBeam | None
+    modes: Sequence[Indices], cl: Cl, lmax: int, x: ScannedBeam, y: ScannedBeam | None
 ) -> tuple[ScannedBeam, ScannedBeam]:
     """Return both beams; raise InputError for modes that cannot exist, or a spectrum or beam that ends below lmax."""
     check_modes(modes)
@@ -175,7 +160,7 @@ class _Seen(NamedTuple):
     """(2l+1) C_l/4pi of the sky, and the tables of two beams, whose first l1 or l2 is ``low``."""
 
     low: int
-    power: NDArray[np.float64]
+    power: Cl
     x: NDArray[np.complex128]
     y: NDArray[np.complex128]
 

@@ -11,6 +11,7 @@ from scipy.special import ellipj, ellipkm1
 from mcsim.errors import InputError
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.sphere.checks import check_whole
+from mcsim.support.arrays import Matrix, Vector
 
 _NODES = 128
 _FAST_PRECESSION = 50.0
@@ -18,9 +19,7 @@ _GRADED = 60
 _TINY = 1e-18
 
 
-def limit_moments(
-    model: ScanModel, theta: NDArray[np.float64], smax: int
-) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+def limit_moments(model: ScanModel, theta: Vector, smax: int) -> tuple[Vector, NDArray[np.complex128]]:
     """Return hits and orientation moments of a model's first default line of sight after infinite time.
 
     ``theta`` are ecliptic colatitudes in radians, shape (n,). InputError if the precession is not much faster than the
@@ -77,7 +76,7 @@ def limit_moments(
     return density, w
 
 
-def caustics(model: ScanModel) -> NDArray[np.float64]:
+def caustics(model: ScanModel) -> Vector:
     """Return the ecliptic colatitudes in (0, pi), in radians and sorted, at which the limit of the hits is singular."""
     beta = math.radians(_line(model).boresight_angle_deg)
     alpha = math.radians(model.precession_angle_deg)
@@ -87,7 +86,7 @@ def caustics(model: ScanModel) -> NDArray[np.float64]:
     return np.unique([angle for angle in angles if 1e-12 < angle < math.pi - 1e-12])
 
 
-def limit_quadrature(model: ScanModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def limit_quadrature(model: ScanModel) -> tuple[Vector, Vector]:
     """Return theta and weights: sum(weights f(theta)) is the integral of f(theta) sin(theta) over 0 to pi.
 
     f may have the caustics of the limit.
@@ -96,9 +95,7 @@ def limit_quadrature(model: ScanModel) -> tuple[NDArray[np.float64], NDArray[np.
     return theta, weight / (2.0 * math.pi)
 
 
-def graded_rule(
-    breaks: NDArray[np.float64], count: Callable[[float], int]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def graded_rule(breaks: Vector, count: Callable[[float], int]) -> tuple[Vector, Vector]:
     """Return colatitudes and weights: sum(weights f(theta)) is the integral over the sphere of an f that has breaks.
 
     Between two of them it is a double-exponential rule (Takahasi & Mori 1974) of 2 ``count`` (half their distance) + 1
@@ -131,7 +128,7 @@ def _line(model: ScanModel) -> LineOfSight:
     return model.select()[0]
 
 
-def _elliptic_nodes(roots: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _elliptic_nodes(roots: Matrix) -> tuple[Vector, Matrix]:
     """Return the integral of 1/sqrt|(c-r1)(c-r2)(c-r3)(c-r4)| over [r2, r3], and nodes c uniform in its argument.
 
     ``roots`` has shape (4, n), sorted; the nodes have shape (_NODES, n).
