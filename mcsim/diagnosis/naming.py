@@ -13,7 +13,6 @@ from mcsim.diagnosis.drawn import is_drawn
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.errors import InputError
-from mcsim.systematics import Effect
 
 
 def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[Attribution, list[str]]:
@@ -38,7 +37,8 @@ def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[
         elif place < settings.compared_sets:
             one = replace(one, findings=slices.findings(members, list(_actions(data, refined, one))))
             if one.findings.contradict(settings):
-                doubt = contradiction(one.findings, members, _effects(context, one), settings.consistency_level)
+                effects = [candidates[k].fitted(*part) for k, *part in parts_of(candidates, one.members, one.fit)]
+                doubt = contradiction(one.findings, members, effects, settings.consistency_level)
                 doubted.append((one, doubt))
                 continue
         if why:
@@ -89,11 +89,6 @@ def unconfirmed(context: DiagnosisContext, found: Attribution, reduced: bool) ->
     if is_drawn(candidate) or one.findings.measured:
         return ""
     return f"The data vector fits {candidate.title}, which is not named: no two parts of the data measure it."
-
-
-def _effects(context: DiagnosisContext, one: Explanation) -> list[Effect]:
-    candidates = context.candidates
-    return [candidates[member].fitted(*part) for member, *part in parts_of(candidates, one.members, one.fit)]
 
 
 def _actions(data: DataSet[Any], refined: Refined, one: Explanation) -> Iterator[Action]:

@@ -97,13 +97,10 @@ class Derivative:
 
 
 def _maps(shared: Survey, sky: Alm, realization: int, with_dipole: bool) -> Maps:
-    seen = shared if with_dipole else replace(shared, channels=tuple(_without_dipole(c) for c in shared.channels))
+    still = (replace(channel, site=replace(channel.site, dipole_uk=np.zeros(3))) for channel in shared.channels)
+    seen = shared if with_dipole else replace(shared, channels=tuple(still))
     hit = np.stack([m.moments.hits > 0 for m in shared.maps])
     return np.where(hit, simulate.maps(seen, realization, sky=sky), 0.0)
-
-
-def _without_dipole(channel: Channel) -> Channel:
-    return replace(channel, site=replace(channel.site, dipole_uk=np.zeros(3)))
 
 
 def derivatives(
