@@ -207,12 +207,14 @@ class Cost:
     each_s: float
     parts: tuple[tuple[str, str], ...]
     once_s: float = 0.0  #: processor time of what all realizations share
+    driver: float = 4e8  #: memory of the process that drives the workers, in bytes
 
     def lines(self, number: int, workers: int) -> list[str]:
         """Return lines on memory, parts and time for a number of realizations."""
         total_s, plural = number * self.each_s + self.once_s, "s" if workers > 1 else ""
         return [
-            f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} worker{plural}",
+            f"  memory  {self.memory / 1e9:.2f} GB per worker, {workers} worker{plural}; about "
+            f"{self.driver / 1e9:.1f} GB of the command itself",
             *(f"  {part:<7} {words}" for part, words in self.parts),
             f"  time    {duration(self.each_s)} per realization and core, {duration(total_s)} of processor time,"
             f" {duration(total_s / workers)} with {workers} worker{plural} on as many idle cores",

@@ -208,7 +208,7 @@ def test_a_signal_is_not_hidden_by_the_mean_field_of_noise(small_store: Path, tm
 def test_dry_run_says_the_cost_and_computes_nothing(mcsim: Command, tmp_path: Path) -> None:
     code, out, _ = mcsim("run", "quickstart", "--dry-run")
     assert code == 0
-    for word in ("memory", "disk", "files", "time", "realizations"):
+    for word in ("memory", "disk", "files", "time", "realizations", "0.4 GB of the command"):
         assert word in out
     assert list(tmp_path.iterdir()) == []
 
