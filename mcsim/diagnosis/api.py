@@ -180,10 +180,16 @@ def describe(
         head += f"; and at most {given} of {source.label}{stored}, whose own cost is not in what follows"
     priors = [f"nuisance: {line}" for one in analysis.nuisances for line in one.lines]
     lines = [head, *priors, *cost.lines(analysis, planned)]
+    if folders.is_cached(_place(_key(run, analysis))):
+        lines.append("  cache   has what these simulations tell: none of them is left to do")
+    elif done := sum(len(kept(run, analysis).found(job)) for job in jobs):
+        lines.append(f"  cache   has {done} of these simulations")
+    lines.append("if the data depart from the model: some hundred more simulations, of effects that are fitted to them")
     if source is None and table is None:
         more = simulated_scores.SIMULATIONS
         lines.append(
-            f"if the verdict is unknown: {more} more simulations, once, and again if a period or source is found"
+            f"if the verdict is unknown: {more} more, each a few times as long, once, "
+            "and again if a period or source is found"
         )
     if count:
         lines += controls.describe(analysis, count, run.compute.workers)
@@ -258,15 +264,19 @@ def _learned(
     """Simulate a model or load it from the cache; single simulations stay for the verdict after a first one alone."""
     simulations = analysis.settings.simulations
     campaign.check_count(analysis, simulations)
-    name = f"diagnose/{key}.zarr"
 
     def fill(scratch: Path) -> None:
         null_ensemble.save(scratch, *campaign.learned(analysis, ask, simulations))
 
-    found = null_ensemble.load(folders.cached(name, fill))
+    found = null_ensemble.load(folders.cached(_place(key), fill))
     if analysis.settings.sims_per_element >= DiagnosisSettings().sims_per_element:
         shutil.rmtree(kept(run, analysis).folder, ignore_errors=True)
     return found
+
+
+def _place(key: str) -> str:
+    """Return where the cache has a model that is learned."""
+    return f"diagnose/{key}.zarr"
 
 
 def _key(run: config.RunConfig, analysis: Analysis, settings: DiagnosisSettings | None = None) -> str:

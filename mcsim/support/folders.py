@@ -262,6 +262,11 @@ def cached(name: str, fill: Callable[[Path], None]) -> Path:
     return folder
 
 
+def is_cached(name: str) -> bool:
+    """Return True if :func:`cached` would find this folder whole."""
+    return _is_whole(default_cache_dir() / name)
+
+
 def _contents(folder: Path) -> dict[str, tuple[int, int]]:
     """Return the sizes of all files in a folder, in bytes, and their CRC-32, by their paths in it."""
     return {str(path.relative_to(folder)): _content(path) for path in folder.rglob("*") if path.is_file()}

@@ -78,6 +78,7 @@ def whole(tmp_path_factory):
 def test_what_was_simulated_is_not_simulated_again_and_the_result_is_the_same(monkeypatch, tmp_path, whole):
     monkeypatch.setenv("MCSIM_CACHE", str(tmp_path))
     maps, rows = data(), []
+    assert "  cache   " not in api.describe(config.load(MODEL), SETTINGS)
     for stop in (1, 7, 12):
         with monkeypatch.context() as patch:
             counted = Counted(patch, stop)
@@ -85,11 +86,13 @@ def test_what_was_simulated_is_not_simulated_again_and_the_result_is_the_same(mo
                 mcsim.diagnose(MODEL, maps, settings=SETTINGS)
         rows += counted.rows
         assert list(tmp_path.glob("diagnose/*.parts/*/*.npy"))
+        assert f"has {len(rows)} of these simulations" in api.describe(config.load(MODEL), SETTINGS)
     with monkeypatch.context() as patch:
         counted = Counted(patch)
         found = mcsim.diagnose(MODEL, maps, settings=SETTINGS)
     assert not list(tmp_path.glob("diagnose/*.parts"))
     assert sorted(rows + counted.rows) == whole[1]
+    assert "none of them is left to do" in api.describe(config.load(MODEL), SETTINGS)
     for field in ("mean", "standard_deviation", "templates", "held_out_pvalues", "data", "residual_maps"):
         np.testing.assert_array_equal(getattr(found, field), getattr(whole[0], field))
     assert found.test == whole[0].test
@@ -128,6 +131,9 @@ def test_the_cost_is_said_with_time_memory_and_disk():
     assert numbers[0] < numbers[1]
     for lines in (few, whole):
         assert [line.split()[0] for line in lines[1:4]] == ["memory", "disk", "time"]
+        # Beside a worker's, the results of all simulations, and what fits and report take.
+        worker, command = (float(lines[1].split(" GB")[place].split()[-1]) for place in (0, 1))
+        assert worker + 0.1 < command < worker + 0.4
 
 
 def test_pieces_are_of_realizations_that_are_missing_and_of_the_same_simulations(tmp_path):
