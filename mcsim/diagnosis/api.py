@@ -179,10 +179,10 @@ def describe(
         stored = "" if source.count is None else f", of {source.count} that are stored"
         head += f"; and at most {given} of {source.label}{stored}, whose own cost is not in what follows"
     priors = [f"nuisance: {line}" for one in analysis.nuisances for line in one.lines]
-    lines = [head, *priors, *cost.lines(analysis, planned)]
+    lines, held = [head, *priors, *cost.lines(analysis, planned)], kept(run, analysis)
     if folders.is_cached(_place(_key(run, analysis))):
         lines.append("  cache   has what these simulations tell: none of them is left to do")
-    elif done := sum(len(kept(run, analysis).found(job)) for job in jobs):
+    elif done := sum(len(held.found(job)) for job in jobs):
         lines.append(f"  cache   has {done} of these simulations")
     lines.append("if the data depart from the model: some hundred more simulations, of effects that are fitted to them")
     if source is None and table is None:
