@@ -55,7 +55,7 @@ def test_an_index_is_a_coordinate_where_the_channels_tell_it() -> None:
 def test_no_gap_where_there_is_none(three: DiagnosisContext) -> None:
     shared = data_of(three.run)
     p = [
-        global_test(three.null, three.analysis.data_vector(maps), three.groups, three.calibration).pvalue
+        global_test(three.null, three.analysis.data_vector(maps), three.always, three.calibration).pvalue
         for maps in (list(simulate.maps(shared, number)) for number in range(100))
     ]
     # 13 of 100 uniform numbers or more are below 0.05 in one case of 700; and Kolmogorov-Smirnov.

@@ -85,7 +85,7 @@ def test_p_is_uniform_over_the_prior_and_not_without_the_nuisances(declared, und
     rows = data_vectors(job)
     p = {}
     for name, known in (("declared", declared), ("undeclared", undeclared)):
-        p[name] = [global_test(known.null, x, known.groups, known.calibration).pvalue for x in rows]
+        p[name] = [global_test(known.null, x, known.always, known.calibration).pvalue for x in rows]
     # P-values are ranks among those of the simulations, a sample like that of the data.
     assert ks_2samp(p["declared"], np.arange(1.0, SIMULATIONS + 1.0) / (SIMULATIONS + 1.0)).pvalue > 1e-3
     alarms = np.mean(np.array(p["declared"]) <= 0.05)
@@ -112,7 +112,7 @@ def test_an_effect_is_named_beside_nuisances_that_are_far_from_zero(run, declare
     assert [(one.name, one.channel) for one in found.effects] == [("beam_ellipticity", "W1")]
     # Templates are measured anew for the effect, and not for the gap: once the data were looked at it would be another.
     assert not np.array_equal(found.templates, declared.templates)
-    assert found.test == global_test(declared.null, data.x, declared.groups, declared.calibration)
+    assert found.test == global_test(declared.null, data.x, declared.always, declared.calibration)
     assert abs(found.effects[0].amplitude - 0.5) < 4.0 * found.effects[0].sigma
     for one, truth in zip(found.nuisances, drawn, strict=True):
         assert (one.name, one.channel) == (truth.name, truth.channel)
