@@ -41,7 +41,7 @@ def test_a_ring_in_one_channel_is_not_called_the_opposite_ring_in_the_other_alon
 
 
 def test_a_set_that_no_other_agrees_beside_is_left_out(known):
-    """What the twin leaves has p between 0.01 and 0.02 here."""
+    """At the level of 0.01 the ring that is there is accepted too, and both are a set."""
     model = replace(known.analysis.model, settings=replace(known.settings, residual_level=0.02))
     known = replace(known, analysis=replace(known.analysis, model=model))
     data = data_of(known.run, "beam_sidelobe", "W1", seed=1020, amplitude=0.0018, calibrated="dipole")
