@@ -11,8 +11,7 @@ import mcsim
 from mcsim import config
 from mcsim.config import preparation as declared
 from mcsim.diagnosis.api import _warnings
-from mcsim.ensemble import plan
-from mcsim.ensemble.detectability import sky_fraction
+from mcsim.ensemble import detectability, plan
 from mcsim.ensemble.prepare import prepare_files
 from mcsim.instrument import scan
 from mcsim.simulation import power, sampled, simulate, windows
@@ -299,7 +298,7 @@ def test_weights_of_apodised_steps_count_once():
     by_step = survey(run_with({"kind": "degrade", "nside": COARSE}, {"kind": "mask", "mask": weights}))
     by_map = survey(run_with({"kind": "degrade", "nside": COARSE}, map={"nside": FINE, "mask": weights}))
     assert by_step.pair_norm == pytest.approx(by_map.pair_norm)
-    assert sky_fraction(by_step, (0, 0)) == pytest.approx(sky_fraction(by_map, (0, 0)))
+    assert detectability.sky_fraction(by_step, (0, 0)) == pytest.approx(detectability.sky_fraction(by_map, (0, 0)))
     assert simulate.realize(by_step, 0)["cl"] == pytest.approx(simulate.realize(by_map, 0)["cl"], rel=1e-9)
 
 
