@@ -161,7 +161,7 @@ class Subsets:
         parts = part / self._beside.size[subsets]
         scatter = np.sum(self._beside.chi2[subsets] * parts, axis=1)
         spread = np.sum(self._beside.spread[subsets] * parts**2, axis=1)
-        prior = special.gammaln(size + 1) + np.full(size, np.log(1.0 / len(self.candidates))).sum()  # all are alike
+        prior = special.gammaln(size + 1) - size * np.log(len(self.candidates))
         return Solved(
             chi2=self.total - delta_chi2,
             pvalue=null.residual_test(self.total - delta_chi2, K, allowance + scatter, spread),
