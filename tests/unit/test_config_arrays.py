@@ -25,7 +25,6 @@ CL = np.concatenate([[0.0, 0.0], 1.0 / np.arange(2, LMAX + 1) ** 2])
 SKY = gaussian_alm(CL, np.random.default_rng(8))
 MASK = (np.random.default_rng(9).random(12 * NSIDE**2) > 0.3).astype(float)
 WINDOW = np.exp(-((np.arange(LMAX + 1) / 60.0) ** 2))
-SAMPLED = {"sample_period_s": 600.0, "line_of_sight": "W1A"}
 MODEL = ScanModel.load("wmap_focal_plane").with_sampling(600.0).with_lines_of_sight("W1A")
 
 
