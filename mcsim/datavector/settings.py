@@ -88,8 +88,8 @@ class DiagnosisSettings:
         Simulations per independent element of the data vector, at least ``scan_sims`` in all; and per element, after
         which these are counted.
     worth_per_element
-        Simulations of a sample covariance per independent element that a shrunk one must be worth: from 500 on it is
-        looked at after every quarter per element, and no more are made.
+        Simulations of a sample covariance per independent element that a shrunk one must be worth, after which no more
+        are made: looked at from 500 on, with 250 elements or more.
     shrunk
         Shrink the covariance (:func:`mcsim.stats.shrinkage.shrunk`), unless ``simulations`` is given. That of a sample
         needs 10 per element.
