@@ -4,9 +4,11 @@ import dataclasses
 import doctest
 import importlib
 import inspect
+import re
 import subprocess
 import sys
 from contextlib import contextmanager
+from pathlib import Path
 from pydoc import plain, render_doc
 
 import ducc0
@@ -19,6 +21,7 @@ import mcsim
 from datasets import undescribed
 from mcsim import config
 from mcsim.bipolar import estimate, estimator
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.ensemble import plan
 from mcsim.ensemble.runner import cluster
 from mcsim.instrument.beams import Beam
@@ -317,3 +320,10 @@ def test_beam_of_an_array_is_that_of_its_file(tmp_path) -> None:
         np.testing.assert_array_equal(found.blm, read.blm)
     found.save(tmp_path / "beam.npz")
     assert Beam.from_blm(tmp_path / "beam.npz").blm.tobytes() == found.blm.tobytes()
+
+
+def test_the_page_on_a_diagnosis_names_the_keys_of_its_verdict() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "science" / "diagnosis.md").read_text("utf-8")
+    keys = re.findall(r'"(\w+)":', inspect.getsource(DiagnosisResult.to_json))
+    assert {"gap", "heard", "simulator"} < set(keys)
+    assert [key for key in keys if f"`{key}`" not in page and f"gap.{key}`" not in page] == []
