@@ -7,10 +7,10 @@ from instruments import ask, data_of, learned, scored, two_channels
 from mcsim import config
 from mcsim.datavector.campaign import with_effects
 from mcsim.diagnosis import unlisted
-from mcsim.diagnosis.fitted_nuisances import FittedNuisances
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.reconstruction import simulated_scores
+from mcsim.reconstruction.fitted_nuisances import FittedNuisances
 from mcsim.simulation import simulate
 from mcsim.simulation.nuisance import tables
 
@@ -34,6 +34,12 @@ def observed(model, realization, *effects):
     run = with_effects(model.run, tables(model.run, SEED, realization))
     maps = list(simulate.maps(data_of(with_effects(run, effects), seed=SEED), realization))
     return ObservedMaps(model, maps, ask)
+
+
+def fitted(data):
+    """Return the nuisances as a diagnosis of the data finds them."""
+    found = diagnose_data(data, "nuisances").nuisances
+    return FittedNuisances.of(data.same_skies, [(one.amplitude, one.sigma) for one in found])
 
 
 def test_a_drift_is_described_beside_calibrations(model):
@@ -62,10 +68,10 @@ def test_scores_do_not_depend_on_what_the_nuisances_are(model, scene):
         effects = [config.Effect(name="calibration", channel="V1", parameters={"amplitude": size})]
         run = with_effects(model.run, effects if size else ())
         data = ObservedMaps(model, list(simulate.maps(data_of(run, seed=SEED), 5)), ask)
-        known = FittedNuisances.of(data, diagnose_data(data, "nuisances").nuisances)
+        known = fitted(data)
         marginal = known.marginal(search, scene)
         raw = simulated_scores.scores_of_maps(model.analysis.model, scene, data.data)
-        clean = simulated_scores.scores_of_maps(model.analysis.model, scene, known.maps.data)
+        clean = simulated_scores.scores_of_maps(model.analysis.model, scene, known.clean.maps)
         found.append((raw, marginal.of(clean, known.z), known.marginalised(search, marginal).simulations.std(axis=0)))
     (raw_0, clean_0, spread), (raw_1, clean_1, _) = found
     measured = spread > 0.0
@@ -78,9 +84,9 @@ def test_perfect_maps_with_nuisances_have_nothing(model, scene):
     search, pvalues = simulated_scores.search_of(model.analysis, scene, scored), []
     for realization in range(10, 20):
         data = observed(model, realization)
-        known = FittedNuisances.of(data, diagnose_data(data, "perfect").nuisances)
+        known = fitted(data)
         marginal = known.marginal(search, scene)
-        x = marginal.of(simulated_scores.scores_of_maps(model.analysis.model, scene, known.maps.data), known.z)
+        x = marginal.of(simulated_scores.scores_of_maps(model.analysis.model, scene, known.clean.maps), known.z)
         own = known.marginalised(search, marginal)
         pvalues.append(own.pvalue(own.evidences(x).max()))
     assert min(pvalues) > 0.01

@@ -7,7 +7,7 @@ import pytest
 
 from instruments import two_channels
 from mcsim import config, systematics
-from mcsim.diagnosis.fitted_nuisances import FittedNuisances, Marginal
+from mcsim.reconstruction.fitted_nuisances import FittedNuisances, Marginal
 from mcsim.reconstruction.structure import ALIKE, Structure
 from mcsim.simulation.nuisance import nuisances_of
 
@@ -55,8 +55,7 @@ def test_which_nuisances_are_taken_from_maps():
     run = config.load({**two_channels("small"), "nuisance": NUISANCES})
     found = nuisances_of(run, systematics.catalogue())
     assert [one.effect.name for one in found if one.subtractable] == ["calibration", "pointing_offset"]
-    data = SimpleNamespace(context=SimpleNamespace(analysis=SimpleNamespace(nuisances=found)))
-    results = [SimpleNamespace(amplitude=amplitude, sigma=0.5) for amplitude in (-0.5, 1.0, 2.0, 3.0, 4.0)]
-    known = FittedNuisances.of(data, results)
+    skies = SimpleNamespace(analysis=SimpleNamespace(nuisances=found))
+    known = FittedNuisances.of(skies, [(amplitude, 0.5) for amplitude in (-0.5, 1.0, 2.0, 3.0, 4.0)])
     assert known.fitted == pytest.approx([-0.008, 2.0, 3.0])  # calibrations to four prior widths at most
     assert known.z == pytest.approx([-4.0, 2.0 / 5.0, 3.0 / 5.0])

@@ -14,6 +14,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element
 from mcsim.diagnosis import unlisted
 from mcsim.diagnosis.inference import reduction_of
+from mcsim.reconstruction.simulated_effects import Reconstruction
 from mcsim.stats.excess import HeldOut, Measured
 from mcsim.stats.gaussian import SimulatedGaussian
 
@@ -109,6 +110,5 @@ def test_names_of_effects_that_a_run_or_a_library_has_are_not_given_again():
     """An earlier description that the run names would be written over, and the run changed."""
     run = SimpleNamespace(effects=(SimpleNamespace(name="/out/unlisted_1.py"), SimpleNamespace(name="gain_drift")))
     analysis = SimpleNamespace(run=run, library=(("unlisted_3", None), ("calibration", None)))
-    data = SimpleNamespace(context=SimpleNamespace(analysis=analysis))
-    made = unlisted.Reconstruction(data, data, None, None, np.zeros(0), None)
+    made = Reconstruction(SimpleNamespace(analysis=analysis), None, None, np.zeros(0), None)
     assert made.names == ("unlisted_2", "unlisted_4", "unlisted_5")

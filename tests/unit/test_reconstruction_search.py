@@ -11,6 +11,7 @@ from mcsim.diagnosis import unlisted
 from mcsim.reconstruction.grammar import LOWEST
 from mcsim.reconstruction.plugin import CONSTANT
 from mcsim.reconstruction.search import ALTERNATIVES, LEVEL, MOST, RARE, Response, Search, evidence
+from mcsim.reconstruction.simulated_effects import Reconstruction
 from mcsim.reconstruction.structure import ALIKE, ANY, OFFSET, Structure
 
 
@@ -314,6 +315,6 @@ def test_a_structure_is_fitted_to_all_maps_of_the_first_fold(monkeypatch):
     context = SimpleNamespace(settings=None, ensemble=SimpleNamespace(remix=lambda matrix: None))
     data = SimpleNamespace(context=context, halves=lambda: (np.eye(1), "halves"), x=np.zeros(1))
     scene = SimpleNamespace(views=split, splits=("a", "b", "c"))
-    made = unlisted.Reconstruction(data, data, scene, search, np.zeros(3), None)
-    assert made.reduction([found], [SimpleNamespace(name="unlisted_1")]) is None
+    made = Reconstruction(None, scene, search, np.zeros(3), None)
+    assert unlisted.reduction_of(data, made, [found], [SimpleNamespace(name="unlisted_1")]) is None
     assert [one.views for one in fitted] == [(0, 2)]

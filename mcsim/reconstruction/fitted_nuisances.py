@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.datavector.analysis import simulated_maps
 from mcsim.datavector.campaign import constrained_jobs
-from mcsim.diagnosis.nuisance import NuisanceResult
-from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.datavector.same_skies import SameSkies
 from mcsim.reconstruction.scores import Scene
 from mcsim.reconstruction.search import SMALL, Search
 from mcsim.reconstruction.simulated_scores import SEED, scores_of_maps
@@ -62,20 +61,23 @@ class FittedNuisances:
     What is missing may look like a nuisance of any size: beyond REACH prior widths it is not taken for one.
     """
 
-    data: ObservedMaps
+    skies: SameSkies  # of the observed maps
     nuisances: tuple[Nuisance, ...]
     fitted: Vector  # coordinates, (k,)
     errors: Vector  # (k,)
 
     @classmethod
-    def of(cls, data: ObservedMaps, found: Sequence[NuisanceResult]) -> "FittedNuisances":
-        """Part the nuisances of a model by whether they can be taken from maps; ``found``: each component of all."""
-        every = data.context.analysis.nuisances
+    def of(cls, skies: SameSkies, found: Sequence[tuple[float, float]]) -> "FittedNuisances":
+        """Part the nuisances of a model by whether they can be taken from maps.
+
+        ``found`` has the amplitude and the error that the data give to each component of all.
+        """
+        every = skies.analysis.nuisances
         kept = np.repeat([one.subtractable for one in every], [len(one.widths) for one in every]).astype(bool)
-        values = np.array([[one.amplitude, one.sigma] for one in found]).reshape(-1, 2)[kept]
+        values = np.array(found).reshape(-1, 2)[kept]
         own = tuple(one for one in every if one.subtractable)
         most = REACH * _widths(own)
-        return cls(data, own, np.clip(values[:, 0], -most, most), values[:, 1])
+        return cls(skies, own, np.clip(values[:, 0], -most, most), values[:, 1])
 
     @property
     def z(self) -> Vector:
@@ -83,14 +85,14 @@ class FittedNuisances:
         return self.fitted / _widths(self.nuisances)
 
     @property
-    def maps(self) -> ObservedMaps:
-        """Return the observed maps without the nuisances as they are fitted."""
+    def clean(self) -> SameSkies:
+        """Return the same with the observed maps without the nuisances as they are fitted."""
         if not self.nuisances:
-            return self.data
+            return self.skies
         before, after = (self._simulated(one) for one in ([], self._tables(self.fitted)))
         change = np.mean([np.subtract(b, a) for a, b in zip(before, after, strict=True)], axis=0)
-        pairs = zip(self.data.data, change, strict=True)
-        return replace(self.data, data=[np.where(one == healpy.UNSEEN, one, one - more) for one, more in pairs])
+        pairs = zip(self.skies.maps, change, strict=True)
+        return replace(self.skies, maps=[np.where(one == healpy.UNSEEN, one, one - more) for one, more in pairs])
 
     def _tables(self, coordinates: Vector) -> list[config.Effect]:
         parts = np.split(coordinates, np.cumsum([len(one.widths) for one in self.nuisances])[:-1])
@@ -98,8 +100,8 @@ class FittedNuisances:
 
     def _simulated(self, tables: list[config.Effect]) -> list[list[Map]]:
         """Return the maps of skies that the data constrain, with effects."""
-        observed = self.data.same_skies.observed_with(self._tables(self.fitted))
-        jobs = constrained_jobs(self.data.context.analysis, tables, observed, range(SKIES))
+        observed = self.skies.observed_with(self._tables(self.fitted))
+        jobs = constrained_jobs(self.skies.analysis, tables, observed, range(SKIES))
         return [maps for job in jobs for maps in simulated_maps(job)]
 
     def drawn(self, count: int) -> Matrix:
@@ -112,7 +114,7 @@ class FittedNuisances:
         mean = search.simulations.mean(axis=0)
         if not self.nuisances:
             return Marginal(mean, np.zeros((0, len(mean))), (), np.zeros((0, 0)))
-        model, steps = self.data.context.analysis.model, np.diag(self.errors)
+        model, steps = self.skies.analysis.model, np.diag(self.errors)
 
         def scores(tables: list[config.Effect]) -> Vector:
             return np.mean([scores_of_maps(model, scene, maps) for maps in self._simulated(tables)], axis=0)
