@@ -40,9 +40,9 @@ def cmb_biposh_leading(
     (-1)^l sqrt(2l+1) C_l B^X_l B^Y_l. The error is of second order in b_ls: halving b_l2 quarters it
     (tests/unit/test_predict_brute_force.py); :func:`cmb_biposh_exact` includes it.
     """
-    x, y = _checked(modes, cl, lmax, x, y)
+    x, y = beams = _checked(modes, cl, lmax, x, y)
     if x.weighted or y.weighted:
-        return _summed(modes, cl, lmax, x, y, nthreads, leading=True)
+        return _summed(modes, cl, lmax, beams, nthreads, leading=True)
     l2 = np.arange(lmax + 1)
     sign = (-1.0) ** l2
     root = np.sqrt(2.0 * l2 + 1)
@@ -84,14 +84,19 @@ def cmb_biposh_exact(
     second-order part: for an elliptical Gaussian of 17.7' and e = 0.46 at l = 1000, where that part is 0.8 % of
     A^{20}, it is within 8e-4, 2.5e-4 and 7e-5 of A^{20} with L_max 32, 64 and 128 (within a sixth of this at l = 400).
     """
-    x, y = _checked(modes, cl, lmax, x, y)
-    return _summed(modes, cl, lmax, x, y, nthreads)
+    return _summed(modes, cl, lmax, _checked(modes, cl, lmax, x, y), nthreads)
 
 
 def _summed(
-    modes: Sequence[Indices], cl: Cl, lmax: int, x: ScannedBeam, y: ScannedBeam, nthreads: int, leading: bool = False
+    modes: Sequence[Indices],
+    cl: Cl,
+    lmax: int,
+    beams: tuple[ScannedBeam, ScannedBeam],
+    nthreads: int,
+    leading: bool = False,
 ) -> NDArray[np.complex128]:
     """Return the sum over L1, L2 of :func:`cmb_biposh_exact`; ``leading``: without products of non-circular parts."""
+    x, y = beams
     result = np.full((len(modes), lmax + 1), np.nan, dtype=np.complex128)
     groups: dict[tuple[int, int], list[int]] = {}
     for i, (L, _, d) in enumerate(modes):
