@@ -7,9 +7,10 @@ import numpy as np
 
 from mcsim import config
 from mcsim.datavector.candidate import Candidate, columns_of, parts_of, scatters_of
+from mcsim.datavector.nuisances import Regression, with_priors
 from mcsim.diagnosis.consistency import amplitudes
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
-from mcsim.diagnosis.nuisance import NuisanceResult, Regression, results, with_priors
+from mcsim.diagnosis.nuisance_result import NuisanceResult, results
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import CandidateResult, DiagnosisResult, EffectResult, EffectSet
 from mcsim.diagnosis.selection import Explanation

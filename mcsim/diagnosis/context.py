@@ -14,9 +14,9 @@ from mcsim.datavector.analysis import Analysis
 from mcsim.datavector.campaign import Ask, after_jobs, skies
 from mcsim.datavector.candidate import Candidate, TemplateBank
 from mcsim.datavector.localisation import Place
+from mcsim.datavector.nuisances import with_nuisances
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.diagnosis.nuisance import with_nuisances
 from mcsim.diagnosis.selection import Attribution
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates

@@ -12,11 +12,11 @@ from scipy.linalg import block_diag
 from mcsim import config
 from mcsim.datavector.candidate import columns_of, parts_of, scatters_of, tables_at, tables_beside
 from mcsim.datavector.halves import Halves
+from mcsim.datavector.nuisances import with_priors
 from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import as_seen
 from mcsim.diagnosis.naming import agreeing, unconfirmed
-from mcsim.diagnosis.nuisance import with_priors
 from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.rivals import with_rivals

@@ -12,10 +12,10 @@ import numpy as np
 from mcsim import config
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.localisation import Place, places, standardised
+from mcsim.datavector.nuisances import half_given_other
 from mcsim.datavector.same_skies import SameSkies, Skies
 from mcsim.datavector.wiener_filter import Part
 from mcsim.diagnosis.context import DataSet
-from mcsim.diagnosis.nuisance import half_given_other
 from mcsim.diagnosis.selection import Attribution
 from mcsim.errors import InputError
 from mcsim.support.arrays import Map, Matrix, Vector

@@ -15,7 +15,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element
 from mcsim.diagnosis.consistency import Comparison, MapCheck
 from mcsim.diagnosis.control_result import Controls
-from mcsim.diagnosis.nuisance import NuisanceResult
+from mcsim.diagnosis.nuisance_result import NuisanceResult
 from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.ensemble.store import write_dataset
 from mcsim.errors import InputError

@@ -15,11 +15,11 @@ from mcsim import config, systematics
 from mcsim.datavector import campaign
 from mcsim.datavector.analysis import analysis_of, data_vectors
 from mcsim.datavector.campaign import seeded, with_effects
+from mcsim.datavector.nuisances import Regression
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import api, report, words
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data
-from mcsim.diagnosis.nuisance import Regression
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.ensemble.maps import file_names

@@ -12,11 +12,12 @@ from instruments import two_channels
 from mcsim import config, systematics
 from mcsim.datavector.analysis import analysis_of, simulated_maps
 from mcsim.datavector.candidate import Candidate, numbered
+from mcsim.datavector.nuisances import Regression, half_given_other, with_nuisances, with_priors
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element
 from mcsim.diagnosis.api import _key, describe
-from mcsim.diagnosis.nuisance import Regression, half_given_other, results, with_nuisances, with_priors
+from mcsim.diagnosis.nuisance_result import results
 from mcsim.information.result import marginalised
 from mcsim.simulation import simulate
 from mcsim.simulation.nuisance import (

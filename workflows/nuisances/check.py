@@ -30,11 +30,11 @@ from mcsim import config
 from mcsim.datavector.analysis import analysis_of, data_vectors
 from mcsim.datavector.campaign import PER_TASK, Ask, asking, batch, seeded, with_effects
 from mcsim.datavector.kept import Kept
+from mcsim.datavector.nuisances import Regression
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.inference import diagnose_data
-from mcsim.diagnosis.nuisance import Regression
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.simulation import nuisance, simulate
 from mcsim.simulation.survey import survey
