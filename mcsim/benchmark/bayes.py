@@ -6,12 +6,13 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from scipy import special
 
 from mcsim.benchmark.case import Answer, Drawn
 from mcsim.benchmark.models import EffectsLibrary
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.sphere import rng
-from mcsim.stats.detection import pair_log_marginals, posterior
+from mcsim.stats.detection import log_marginals, pair_log_marginals
 from mcsim.support.arrays import Vector
 
 
@@ -21,8 +22,8 @@ class BayesClassifier:
 
     Notes
     -----
-    One effect: :func:`mcsim.stats.detection.posterior`. Two: :func:`mcsim.stats.detection.pair_log_marginals`, with 256
-    antithetic draws. Directions are taken to be isotropic, also where parameters reach only some. Effects that were
+    One effect: :func:`mcsim.stats.detection.log_marginals`. Two: :func:`mcsim.stats.detection.pair_log_marginals`, with
+    256 antithetic draws. Directions are taken to be isotropic, also where parameters reach only some. Effects that were
     left out, or that no library has, are no hypotheses. Checked by brute force: tests/unit/test_challenge.py.
     """
 
@@ -31,41 +32,26 @@ class BayesClassifier:
     def probabilities(self, x: Vector) -> dict[Answer, float]:
         """Return the posterior of sets of effects, shape (p_raw,) to a dict without those below 1e-13 of the best."""
         library, prior = self.sampler.effects_library, self.sampler.prior
-        y = library.null.whiten(x)
-        none = float(library.null.log_likelihood(float(y @ y)))
+        null, groups, identities = library.null, library.groups, library.identities
+        scale = float(np.sqrt(null.hartlap_factor))
+        norms = prior.weakest / scale, prior.strongest / scale
+        edges = np.geomspace(*norms, 61)
+        none, *alone = log_marginals(null, x, groups, np.sqrt(edges[1:] * edges[:-1]))
         with np.errstate(divide="ignore"):  # what the prior excludes has a logarithm of minus infinity
-            shares = np.log([prior.none, prior.one, prior.two])
+            shares, weights = np.log([prior.none, prior.one, prior.two]), np.log(self.sampler.weights)
         terms: list[tuple[Answer, float]] = [(frozenset(), none + shares[0])]
-        for identity, value in zip(library.identities, self._singles(x, y), strict=True):
-            terms.append((frozenset([identity]), none + value + shares[1]))
+        for identity, value in zip(identities, alone + weights, strict=True):
+            terms.append((frozenset([identity]), value + shares[1]))
         if prior.two > 0.0:
-            pairs, weights = list(self._pairs), np.log(list(self._pairs.values()))
-            found = pair_log_marginals(library.null, y, library.groups, pairs, self._norms, self._normals) + weights
+            pairs, chances = list(self._pairs), np.log(list(self._pairs.values()))
+            found = pair_log_marginals(null, null.whiten(x), groups, pairs, norms, self._normals) + chances
             for (i, j), value in zip(pairs, found, strict=True):
-                terms.append((frozenset([library.identities[i], library.identities[j]]), value + shares[2]))
+                terms.append((frozenset([identities[i], identities[j]]), value + shares[2]))
         logs: dict[Answer, float] = {}
         for answer, value in terms:
             logs[answer] = float(np.logaddexp(logs.get(answer, -np.inf), value))
-        top = max(logs.values())
-        scale = sum(np.exp(value - top) for value in logs.values())
-        return {answer: float(np.exp(value - top) / scale) for answer, value in logs.items() if value > top - 30.0}
-
-    @property
-    def _norms(self) -> tuple[float, float]:
-        """Return the smallest and largest whitened norm of an effect."""
-        scale = float(np.sqrt(self.sampler.effects_library.null.hartlap_factor))
-        return self.sampler.prior.weakest / scale, self.sampler.prior.strongest / scale
-
-    def _singles(self, x: Vector, y: Vector) -> Vector:
-        """Return the log marginal likelihood of each candidate relative to no effect, prior weight included."""
-        null, groups = self.sampler.effects_library.null, self.sampler.effects_library.groups
-        # Where an effect is strong, the probability of none would underflow: its scale is free.
-        boost = min(0.5 * float(np.max(groups.delta_chi2(y), initial=0.0)), 600.0)
-        edges = np.geomspace(*self._norms, 61)
-        scale = np.concatenate([[np.exp(boost)], self.sampler.weights])
-        found = posterior(null, x, groups, np.sqrt(edges[1:] * edges[:-1]), scale)
-        with np.errstate(divide="ignore"):
-            return np.asarray(np.log(found[1:]) - np.log(found[0]) + boost)
+        found = special.softmax(list(logs.values()))
+        return {answer: float(p) for answer, p in zip(logs, found, strict=True) if p > np.exp(-30.0) * found.max()}
 
     @cached_property
     def _pairs(self) -> dict[tuple[int, int], float]:

@@ -136,15 +136,14 @@ def log_evidence(
     return np.asarray(np.logaddexp.reduce(each, axis=0) - np.log(len(widths)))
 
 
-def posterior(
-    null: SimulatedGaussian, x: Matrix, candidates: WhitenedTemplates, strengths: Vector, prior: Vector
-) -> Matrix:
-    """Return the posterior probability of none and of each candidate: the Bayes-optimal classifier of a prior.
+def log_marginals(null: SimulatedGaussian, x: Matrix, candidates: WhitenedTemplates, strengths: Vector) -> Matrix:
+    """Return the log marginal likelihood of none and of each candidate.
+
+    With the logarithm of a prior it classifies in the best possible way.
 
     ``null``, ``x``: distribution of the data vector without an effect, and data, shape (..., p_raw); the result is
     (..., 1 + C). ``candidates``: bases of C hypotheses; a mixture is one whose group has the columns of all its
-    effects. ``strengths``: signal-to-noise ratios that the prior allows, equally, for all candidates, in steps of less
-    than 1. ``prior``: of none and each candidate, shape (1 + C,), >= 0, any scale.
+    effects. ``strengths``: white norms that the prior allows, equally, for all candidates, in steps of less than 1.
 
     Notes
     -----
@@ -161,9 +160,8 @@ def posterior(
     log_sphere = special.gammaln(order) + (1.0 - order) * np.log(z / 2.0) + np.log(special.ive(order - 1.0, z)) + z
     above = -0.5 * w * (strengths**2 + root**2) + log_sphere
     marginal = null.log_likelihood(total - T) + special.logsumexp(above, b=1.0 / len(strengths), axis=-1)
-    logs = np.concatenate([null.log_likelihood(total), np.where(K > 0, marginal, null.log_likelihood(total))], axis=-1)
-    with np.errstate(divide="ignore"):  # what the prior excludes has a logarithm of minus infinity
-        return special.softmax(logs + np.log(prior), axis=-1)
+    none = null.log_likelihood(total)
+    return np.concatenate([none, np.where(K > 0, marginal, none)], axis=-1)
 
 
 def pair_log_marginals(

@@ -5,12 +5,12 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import special, stats
 from scipy.linalg import solve_triangular
 
 from mcsim.datavector.localisation import places
 from mcsim.datavector.summaries import Element
-from mcsim.stats.detection import confusion, detectable, posterior, power, snr_needed, snr_to_separate
+from mcsim.stats.detection import confusion, detectable, log_marginals, power, snr_needed, snr_to_separate
 from mcsim.stats.excess import excess, expected_fall, expected_fall_of_draw, held_out
 from mcsim.stats.gaussian import SimulatedGaussian, nested_pvalue, residual_pvalue
 from mcsim.stats.look_elsewhere import calibrate, global_test, scan_pvalues
@@ -179,7 +179,7 @@ def test_posterior_is_calibrated():
                 basis = exact.basis[:, exact.start[index - 1] : exact.start[index]]
                 direction = rng.normal(size=basis.shape[1])
                 row += rng.choice(strengths) * basis @ direction / np.linalg.norm(direction)
-        probability = posterior(found, x, candidates, strengths, prior)
+        probability = special.softmax(log_marginals(found, x, candidates, strengths) + np.log(prior), axis=1)
         fiducial.append(probability.max(axis=1))
         right.append(probability.argmax(axis=1) == truth)
     confidence, hit = np.concatenate(fiducial), np.concatenate(right)

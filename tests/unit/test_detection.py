@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import special
 
-from mcsim.stats.detection import cosines, detectable, log_evidence, posterior, snr_needed, snr_to_separate
+from mcsim.stats.detection import cosines, detectable, log_evidence, log_marginals, snr_needed, snr_to_separate
 from mcsim.stats.gaussian import SimulatedGaussian
 
 
@@ -39,10 +39,9 @@ def test_posterior_is_bayes_theorem():
         models = [s * direction @ basis.T for s in strengths]
         likelihood.append(np.mean([np.exp(-0.5 * np.sum((x - model) ** 2, axis=1)) for model in models]))
     expected = prior * likelihood / np.sum(prior * likelihood)
-    np.testing.assert_allclose(posterior(known, x, candidates, strengths, prior), expected, rtol=0.02)
-    assert posterior(known, np.stack([x, -x]), candidates, strengths, prior)[1] == pytest.approx(
-        posterior(known, x, candidates, strengths, prior), rel=1e-9
-    )
+    logs = log_marginals(known, x, candidates, strengths)
+    np.testing.assert_allclose(special.softmax(logs + np.log(prior)), expected, rtol=0.02)
+    assert log_marginals(known, np.stack([x, -x]), candidates, strengths)[1] == pytest.approx(logs, rel=1e-9)
 
 
 @pytest.mark.parametrize(("columns", "tests", "strength"), [(1, 1, 3.24), (1, 20, 4.30), (110, 1, 7.2)])
