@@ -15,10 +15,10 @@ from mcsim.benchmark import folder as files
 from mcsim.benchmark.case import Drawn, Member, Truth
 from mcsim.benchmark.folder import Settings
 from mcsim.benchmark.models import LearnedModel, learned_model, workers_of
-from mcsim.benchmark.out_of_library import library_with, responses
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.datavector.campaign import Batch, seeded, with_effects
 from mcsim.datavector.map_checks import of_pixel_means, read_maps
+from mcsim.datavector.out_of_library import library_with, responses
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.ensemble.maps import POINTING, file_names, write_map

@@ -10,7 +10,7 @@ from typing import Any
 
 from mcsim import config, systematics
 from mcsim.benchmark.case import Member, Prior, Truth
-from mcsim.benchmark.out_of_library import load
+from mcsim.datavector.out_of_library import load
 from mcsim.errors import InputError
 from mcsim.support.folders import not_a_file, write_once
 

@@ -1,6 +1,6 @@
 """Describe what cases are judged with: candidates and templates, and a model that is learned once per process."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.benchmark.case import Identity, Member
 from mcsim.benchmark.folder import Settings
-from mcsim.datavector.analysis import Analysis, Job, analysis_of, data_vectors
-from mcsim.datavector.campaign import PER_TASK, Ask, Batch, after_jobs, asking, batch, seeded, with_effects
-from mcsim.datavector.candidate import Candidate, TemplateBank, columns_of, coordinates_of, effects_at, numbered
+from mcsim.datavector.analysis import Job, analysis_of, data_vectors
+from mcsim.datavector.campaign import PER_TASK, Ask, Batch, after_jobs, asking, batch, reduced, seeded, with_effects
+from mcsim.datavector.candidate import Candidate, columns_of, coordinates_of, effects_at
 from mcsim.datavector.halves import Halves
-from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import kept, prepared
-from mcsim.diagnosis.context import DiagnosisContext, calibration_of, context
+from mcsim.diagnosis.context import DiagnosisContext, context
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError, RunError
@@ -120,14 +119,14 @@ def linear_model(known: DiagnosisContext, without: Sequence[str] = (), fresh: Ma
     Its data are ``fresh`` simulations (:func:`simulated`), shape (n, p_raw of the full library), or a quarter of its
     own. Templates are exact here: neither their errors nor the scatter of stochastic effects play a part.
     """
-    analysis, ensemble, bank, rows = reduced(known, without)
+    analysis, ensemble, bank, rows = reduced(known.analysis, known.ensemble, known.bank, without)
     kept = len(ensemble.simulations) - (len(ensemble.simulations) // 4 if fresh is None else 0)
     seen, rest = ensemble.first(kept), ensemble.simulations[kept:] if fresh is None else fresh[:, rows]
     candidates = tuple(replace(candidate, shape_error=None) for candidate in analysis.candidates)
     null, templates = seen.gaussian, bank.significant(ensemble.spread, known.settings)
     groups = null.whiten_groups(templates, [candidate.columns for candidate in candidates])
     halves, data = Halves.of(seen, np.zeros(len(templates))), rest + ensemble.offset
-    return LinearModel(null, templates, candidates, calibration_of(seen, null, groups), rows, halves, data)
+    return LinearModel(null, templates, candidates, seen.calibration(null, groups), rows, halves, data)
 
 
 def simulated(known: DiagnosisContext, number: int, seed: int, ask: Ask) -> Matrix:
@@ -136,25 +135,6 @@ def simulated(known: DiagnosisContext, number: int, seed: int, ask: Ask) -> Matr
     job = replace(known.analysis.job(run), nuisances=bool(run.nuisances))
     starts = range(0, number, PER_TASK)
     return np.concatenate(ask([replace(job, first=first, count=min(PER_TASK, number - first)) for first in starts]))
-
-
-def reduced(
-    known: DiagnosisContext, names: Collection[str]
-) -> tuple[Analysis, NullEnsemble, TemplateBank, NDArray[np.int64]]:
-    """Leave effects out of a library without learning anything again.
-
-    Their candidates, the columns of their templates and the elements that are matched filters of them go. An element
-    does not depend on the others, so the rest is what ``mcsim diagnose --without`` learns from the same simulations.
-    The last array holds the elements of the full data vector that are kept.
-    """
-    analysis = known.analysis
-    kept = [candidate for candidate in analysis.candidates if candidate.name not in names]
-    blocks = tuple(block for block in analysis.blocks if all(one.candidate not in names for one in block.elements))
-    rows = np.flatnonzero([element.candidate not in names for element in analysis.elements])
-    columns = [column for column, label in enumerate(known.bank.labels) if label.effect not in names]
-    without = tuple(sorted({*analysis.without, *names}))
-    fewer = replace(analysis, candidates=numbered(kept), blocks=blocks, without=without)
-    return fewer, known.ensemble.restrict(rows), known.bank.subset(rows, columns), rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +181,7 @@ def _proposing(settings: Settings) -> DiagnosisSettings:
 def _learned(model: str, settings: DiagnosisSettings, without: tuple[str, ...]) -> LearnedModel:
     if without:
         full = _learned(model, settings, ()).context
-        analysis, ensemble, bank, rows = reduced(full, without)
+        analysis, ensemble, bank, rows = reduced(full.analysis, full.ensemble, full.bank, without)
         known = context(analysis, ensemble, bank)
     else:
         run = config.from_json(model)

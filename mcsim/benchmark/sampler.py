@@ -8,7 +8,7 @@ import numpy as np
 
 from mcsim.benchmark.case import KINDS, Drawn, Kind, Member, Prior
 from mcsim.benchmark.models import EffectsLibrary
-from mcsim.benchmark.out_of_library import OutOfLibrary
+from mcsim.datavector.out_of_library import OutOfLibrary
 from mcsim.errors import InputError
 from mcsim.sphere import rng
 from mcsim.support.arrays import Vector
@@ -100,21 +100,8 @@ class CaseSampler:
         index = group[int(draw.integers(len(group)))]
         candidate, white = self.effects_library.candidates[index], self._white(index)
         strength = self.prior.strength(draw)
-        gram, fit = white.T @ white, candidate.parametrization
-        values, vectors = np.linalg.eigh(gram)
-        constrained = values > 1e-9 * values[-1]
-        direction = draw.standard_normal(len(values))
-        theta = vectors[:, constrained] @ (direction[constrained] / np.sqrt(values[constrained]))
-        effect = candidate.with_coordinates(np.abs(theta) if fit.sign else theta, gram).within_bounds()
-        # The parameters reach only some directions, and coordinates need not be linear in the amplitude.
-        for _ in range(30):
-            snr = np.linalg.norm(white @ fit.coordinates(effect))
-            slope = np.log(np.linalg.norm(white @ fit.coordinates(effect.scaled(1.01))) / snr) / np.log(1.01)
-            effect = effect.scaled(float((strength / snr) ** (1.0 / slope)))
-            if abs(snr / strength - 1.0) < 1e-9:
-                break
-        effect = effect.within_bounds()
-        coordinates = fit.coordinates(effect)
+        effect = candidate.of_strength(strength, white, draw.standard_normal(len(candidate.columns)))
+        coordinates = candidate.parametrization.coordinates(effect)
         parameters = {"amplitude": effect.amplitude, **effect.parameters()}
         reached = float(np.linalg.norm(white @ coordinates))
         return Member(name, candidate.channel, parameters, tuple(map(float, coordinates)), reached, index)

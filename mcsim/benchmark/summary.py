@@ -12,7 +12,7 @@ from scipy import stats
 from mcsim.benchmark.case import KINDS, Answer, Record
 from mcsim.stats.intervals import Metric, mean, ratio, removed, share, snr_at_power, width
 from mcsim.support.arrays import Vector
-from mcsim.systematics.signatures import SIGNATURES, Place
+from mcsim.systematics.signatures import any_place_right
 
 ALPHA = 0.05  #: level of the global test
 
@@ -242,9 +242,3 @@ def _named(answer: Answer | None, truth: Answer) -> str:
     ((name, _),) = answer
     other = len(truth) == 1 and answer != truth and {name} == {own for own, _ in truth}
     return f"{name}, other channel" if other else name
-
-
-def any_place_right(names: Sequence[str], places: Sequence[Place]) -> bool | None:
-    """Return True if a place is right for one of the effects; None if none of them has a known signature."""
-    known = [SIGNATURES[name] for name in names if name in SIGNATURES]
-    return any(signature.matches(place) for signature in known for place in places) if known else None

@@ -1,7 +1,7 @@
 """Plan and run the simulations that a diagnosis needs, and turn them into a null ensemble and templates."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cache
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.datavector.analysis import Analysis, Job, data_vectors
 from mcsim.datavector.bipolar_scan import rms
-from mcsim.datavector.candidate import Candidate, TemplateBank
+from mcsim.datavector.candidate import Candidate, TemplateBank, numbered
 from mcsim.datavector.kept import Kept
 from mcsim.datavector.null_ensemble import NullEnsemble, without_nuisances
 from mcsim.datavector.repeats import check_distinct, check_fresh
@@ -288,6 +288,24 @@ def learned(
         slice_elements=analysis.slices,
     )
     return ensemble, TemplateBank(matrix[:size], error[:size], curvature[:size], labels, matrix[size:])
+
+
+def reduced(
+    analysis: Analysis, ensemble: NullEnsemble, bank: TemplateBank, names: Collection[str]
+) -> tuple[Analysis, NullEnsemble, TemplateBank, NDArray[np.int64]]:
+    """Leave effects out of what is :func:`learned` without learning anything again.
+
+    Their candidates, the columns of their templates and the elements that are matched filters of them go. An element
+    does not depend on the others, so the rest is what ``mcsim diagnose --without`` learns from the same simulations.
+    The last array holds the elements of the full data vector that are kept.
+    """
+    kept = [candidate for candidate in analysis.candidates if candidate.name not in names]
+    blocks = tuple(block for block in analysis.blocks if all(one.candidate not in names for one in block.elements))
+    rows = np.flatnonzero([element.candidate not in names for element in analysis.elements])
+    columns = [column for column, label in enumerate(bank.labels) if label.effect not in names]
+    without = tuple(sorted({*analysis.without, *names}))
+    fewer = replace(analysis, candidates=numbered(kept), blocks=blocks, without=without)
+    return fewer, ensemble.restrict(rows), bank.subset(rows, columns), rows
 
 
 def responses(step: float, here: Rows, opposite: Rows | None, same: Rows) -> tuple[Rows, Rows]:

@@ -118,6 +118,26 @@ class Candidate:
         """Return the effect nearest to coordinates in the metric ``precision``."""
         return self.effect(**{**self.parametrization.nearest(coordinates, precision), **self.settings})
 
+    def of_strength(self, strength: float, white: Matrix, direction: Vector) -> Effect:
+        """Return the effect of an expected S/N in a direction, as far as its parameters reach there.
+
+        ``white`` are its templates in standard deviations, shape (p, K), and ``direction``, shape (K,), is along the
+        principal axes of their span.
+        """
+        gram, fit = white.T @ white, self.parametrization
+        values, vectors = np.linalg.eigh(gram)
+        constrained = values > 1e-9 * values[-1]
+        theta = vectors[:, constrained] @ (direction[constrained] / np.sqrt(values[constrained]))
+        effect = self.with_coordinates(np.abs(theta) if fit.sign else theta, gram).within_bounds()
+        # The parameters reach only some directions, and coordinates need not be linear in the amplitude.
+        for _ in range(30):
+            snr = np.linalg.norm(white @ fit.coordinates(effect))
+            slope = np.log(np.linalg.norm(white @ fit.coordinates(effect.scaled(1.01))) / snr) / np.log(1.01)
+            effect = effect.scaled(float((strength / snr) ** (1.0 / slope)))
+            if abs(snr / strength - 1.0) < 1e-9:
+                break
+        return effect.within_bounds()
+
     def fitted(self, coordinates: Vector, covariance: Matrix) -> Effect:
         """Return the effect within its bounds nearest to fitted coordinates, as far as the data constrain them."""
         return self._nearest(coordinates, covariance)[0]

@@ -13,7 +13,8 @@ from pydantic import TypeAdapter
 from mcsim.datavector.candidate import Column, TemplateBank
 from mcsim.datavector.summaries import Element, pair_classes
 from mcsim.ensemble.store import write_dataset
-from mcsim.stats.gaussian import SimulatedGaussian, held_out_pvalues
+from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates, held_out_pvalues
+from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_in_folds, calibrate_on
 from mcsim.support.arrays import Matrix, Vector, divided
 
 QUADRATIC = 0.05  #: share of an element's variance that may come from squares and products of nuisances
@@ -81,6 +82,17 @@ class NullEnsemble:
     def held_out_pvalues(self, null: SimulatedGaussian) -> Vector:
         """Return the p-value of every simulation, of a single sky each, against all others, shape (N,): uniform."""
         return held_out_pvalues(self.simulations, replace(null, scale_variance=self.skies * null.scale_variance))
+
+    def calibration(self, null: SimulatedGaussian, groups: WhitenedTemplates) -> Calibration:
+        """Return the null distribution of the tests, on held-out simulations with nuisances or a shrunk covariance.
+
+        Nuisances make data less Gaussian; a shrunk covariance is better for some templates than for others.
+        """
+        found = calibrate(null, groups)
+        if self.nuisances is not None:
+            single = replace(null, scale_variance=self.skies * null.scale_variance)  # of one sky, as simulations are
+            return calibrate_on(found, single, groups, self.simulations)
+        return calibrate_in_folds(found, null, groups) if null.folds else found
 
     @cached_property
     def tested(self) -> NDArray[np.bool_]:

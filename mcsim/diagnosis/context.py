@@ -20,7 +20,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.selection import Attribution
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
-from mcsim.stats.look_elsewhere import Calibration, GlobalTest, calibrate, calibrate_in_folds, calibrate_on, global_test
+from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
 from mcsim.support.arrays import Matrix, Vector
 
 Data = TypeVar("Data")
@@ -81,20 +81,8 @@ def context(analysis: Analysis, ensemble: NullEnsemble, bank: TemplateBank) -> D
     if ensemble.nuisances is not None:
         candidates, templates = with_nuisances(ensemble, null, analysis.nuisances, candidates, templates)
     groups = null.whiten_groups(templates, [candidate.columns for candidate in candidates])
-    calibration = calibration_of(ensemble, null, groups)
+    calibration = ensemble.calibration(null, groups)
     return DiagnosisContext(analysis, ensemble, bank, null, candidates, calibration, scatter, templates, groups)
-
-
-def calibration_of(ensemble: NullEnsemble, null: SimulatedGaussian, groups: WhitenedTemplates) -> Calibration:
-    """Return the null distribution of the tests, on held-out simulations with nuisances or a shrunk covariance.
-
-    Nuisances make data less Gaussian; a shrunk covariance is better for some templates than for others.
-    """
-    found = calibrate(null, groups)
-    if ensemble.nuisances is not None:
-        single = replace(null, scale_variance=ensemble.skies * null.scale_variance)  # of one sky, as simulations are
-        return calibrate_on(found, single, groups, ensemble.simulations)
-    return calibrate_in_folds(found, null, groups) if null.folds else found
 
 
 @dataclass(frozen=True, eq=False)

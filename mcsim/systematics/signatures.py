@@ -1,5 +1,6 @@
 """Where each effect shows: the frame that it is fixed to, and L and parity of the coefficients that it makes."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 Place = tuple[str | None, int | None, str | None]  #: frame, L and parity of a coefficient; None where it has none
@@ -57,3 +58,9 @@ SIGNATURES = {
     "excess_noise": Signature("", (0,), "even"),
     "lensing": Signature("", (0,), "even"),
 }
+
+
+def any_place_right(names: Sequence[str], places: Sequence[Place]) -> bool | None:
+    """Return True if a place is right for one of the effects; None if none of them has a known signature."""
+    known = [SIGNATURES[name] for name in names if name in SIGNATURES]
+    return any(signature.matches(place) for signature in known for place in places) if known else None

@@ -13,10 +13,10 @@ from mcsim.benchmark import score
 from mcsim.benchmark.case import Prior
 from mcsim.benchmark.challenge import make, run
 from mcsim.benchmark.folder import Settings, finished_cases, key_path, read_key
-from mcsim.benchmark.out_of_library import library_with, load
 from mcsim.benchmark.summary import confusion
 from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.map_checks import read_maps
+from mcsim.datavector.out_of_library import library_with, load
 from pictures import quick_pictures
 from refusals import refused
 

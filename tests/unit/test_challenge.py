@@ -10,13 +10,13 @@ from scipy import integrate, stats
 from mcsim import config, systematics
 from mcsim.benchmark.bayes import BayesClassifier
 from mcsim.benchmark.case import Drawn, Member, Prior, Record, pulls
-from mcsim.benchmark.models import linear_model, reduced, simulated
+from mcsim.benchmark.models import linear_model, simulated
 from mcsim.benchmark.report import lines, write
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.benchmark.score import Draw, _is_named, draws, judge, powers
-from mcsim.benchmark.summary import Score, any_place_right, confusion
+from mcsim.benchmark.summary import Score, confusion
 from mcsim.datavector.analysis import Analysis, Job
-from mcsim.datavector.campaign import batch
+from mcsim.datavector.campaign import batch, reduced
 from mcsim.datavector.candidate import Candidate, TemplateBank, numbered
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
@@ -24,7 +24,7 @@ from mcsim.datavector.summaries import Block, Element
 from mcsim.diagnosis.context import context
 from mcsim.errors import InputError
 from mcsim.stats.look_elsewhere import global_test
-from mcsim.systematics.signatures import SIGNATURES
+from mcsim.systematics.signatures import SIGNATURES, any_place_right
 from refusals import refused
 
 ENTRIES = 24
@@ -302,7 +302,8 @@ def test_pairs_have_the_prior_that_they_are_drawn_with():
 
 
 def test_an_effect_that_is_left_out_takes_only_its_own_columns_and_elements(learned):
-    analysis, ensemble, bank, rows = reduced(learned, ["beam_width"])
+    known = learned.analysis, learned.ensemble, learned.bank
+    analysis, ensemble, bank, rows = reduced(*known, ["beam_width"])
     assert [candidate.name for candidate in analysis.candidates] == ["noise_level", "beam_ellipticity"]
     assert analysis.without == ("beam_width",)
     names = [element.name for element in ensemble.elements]
@@ -315,7 +316,7 @@ def test_an_effect_that_is_left_out_takes_only_its_own_columns_and_elements(lear
     for candidate in analysis.candidates:
         full = learned.bank.matrix[np.ix_(rows, before[candidate.label].columns)]
         np.testing.assert_array_equal(bank.matrix[:, candidate.columns], full)
-    np.testing.assert_array_equal(reduced(learned, [])[2].matrix, learned.bank.matrix)
+    np.testing.assert_array_equal(reduced(*known, [])[2].matrix, learned.bank.matrix)
 
 
 # Figures

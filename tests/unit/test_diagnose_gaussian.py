@@ -6,7 +6,6 @@ from scipy import stats
 
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.summaries import Element
-from mcsim.diagnosis.context import calibration_of
 from mcsim.stats.gaussian import SimulatedGaussian, nested_pvalue, residual_pvalue
 from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_in_folds, global_test, scan_pvalues
 from refusals import refused
@@ -227,6 +226,6 @@ def test_calibration_with_nuisances_is_the_same_for_the_mean_of_any_number_of_sk
     for ensemble in (one, one.of_mean(16)):
         null = ensemble.gaussian
         groups = null.whiten_groups(np.eye(p)[:, :2], [[0], [1]])
-        found.append(calibration_of(ensemble, null, groups).held_out_combined)
+        found.append(ensemble.calibration(null, groups).held_out_combined)
     assert null.scale_variance > 0.02
     np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
