@@ -91,14 +91,10 @@ def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> At
         t = refined.templates[:, columns_of(context.candidates, one.members)]
         scatters = scatters_of(refined.candidates, one.members)
         null = context.null.with_extra_covariance(*scatters)
-        scattered = partial(_scattered, data, one.members, t, scatters) if best else _as_it_is
-        return replace(one, fit=with_priors(null, t, one.fit, members, scattered))
+        scattered = [partial(_scattered, data, one.members, t, scatters)] if best else []
+        return replace(one, fit=with_priors(null, t, one.fit, members, *scattered))
 
     return replace(found, explanations=tuple(errors(one, place == 0) for place, one in enumerate(every)))
-
-
-def _as_it_is(fit: Fit) -> Fit:
-    return fit
 
 
 def _scattered(data: DataSet[Any], members: Sequence[int], t: Matrix, scatters: Sequence[Matrix], first: Fit) -> Fit:

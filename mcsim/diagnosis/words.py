@@ -158,14 +158,17 @@ def held_out(result: DiagnosisResult) -> str:
     if found is None:
         why = "a half of the data hardly measures the effects, or the held-out one shows no excess χ² by itself"
         return f"Not measured: {why if result.sets else 'no effect was added to the simulator'}."
+    start, forecast = "Adding the best fit to the simulator removes", f"; {percent(found.predicted)} was predicted"
+    return _removed(found, start, forecast)
+
+
+def _removed(found: HeldOut, start: str, forecast: str = "") -> str:
+    """Return the reduction on held-out data behind what is done to the simulator, or that it is too uncertain."""
     if found.before.value <= 0.0 or found.achieved.sigma >= LARGEST_ERROR:
         before, after = (measured(one.value, one.sigma) for one in (found.before, found.after))
         return f"Too uncertain to measure a reduction: excess χ² of {found.data} {before} before, {after} after."
     left = f"what remains there {residual(found.pvalue_after)}"
-    return (
-        f"Adding the best fit to the simulator removes {percent(found.achieved)} of the excess χ² of {found.data}; "
-        f"{percent(found.predicted)} was predicted; {left}."
-    )
+    return f"{start} {percent(found.achieved)} of the excess χ² of {found.data}{forecast}; {left}."
 
 
 def refuted(found: HeldOut) -> str:
@@ -191,15 +194,7 @@ def unlisted(result: DiagnosisResult) -> list[str]:
         return [*found, "No effect of the simulator can be like it, so that its reduction is not measured."]
     if held is None:
         return [*found, "Its reduction on held-out data is not measured: they do not respond to it by themselves."]
-    if held.before.value <= 0.0 or held.achieved.sigma >= LARGEST_ERROR:
-        before, after = (measured(one.value, one.sigma) for one in (held.before, held.after))
-        said = f"excess χ² of {held.data} {before} before, {after} after"
-        return [*found, f"Too uncertain to measure a reduction: {said}."]
-    left = f"what remains there {residual(held.pvalue_after)}"
-    return [
-        *found,
-        f"Added to the simulator, this removes {percent(held.achieved)} of the excess χ² of {held.data}; {left}.",
-    ]
+    return [*found, _removed(held, "Added to the simulator, this removes")]
 
 
 def compared_parts(result: DiagnosisResult) -> list[str]:
