@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from mcsim.benchmark.case import Answer, Drawn
+from mcsim.benchmark.case import IN_LIBRARY, Answer, Drawn
 from mcsim.benchmark.models import EffectsLibrary
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.sphere import rng
@@ -78,7 +78,7 @@ def facts(drawn: Drawn, x: Vector, response: Vector, library: EffectsLibrary, ba
 
     Data vector and response of the effects are those of the case's library, shape (p_raw,).
     """
-    known: dict[Answer, float] = bayes.probabilities(x) if drawn.in_library else {}
+    known: dict[Answer, float] = bayes.probabilities(x) if drawn.kind in IN_LIBRARY else {}
     best, probability = max(known.items(), key=lambda item: item[1], default=(None, np.nan))
     members, cosines = drawn.members, []
     for member in members:
@@ -91,7 +91,7 @@ def facts(drawn: Drawn, x: Vector, response: Vector, library: EffectsLibrary, ba
         "columns": len(members[0].coordinates) if len(members) == 1 else 0,
         "weakest": min((member.strength for member in members), default=0.0),
         "rival": max(cosines, default=0.0),
-        "distances": () if drawn.in_library else library.distances(response),
+        "distances": () if drawn.kind in IN_LIBRARY else library.distances(response),
         "bayes": best,
         "bayes_right": probability,
     }

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mcsim.errors import InputError
 from mcsim.support.arrays import Vector
@@ -102,11 +101,6 @@ class Drawn:
         """Return names and channels of the effects that act."""
         return frozenset(member.identity for member in self.members)
 
-    @property
-    def in_library(self) -> bool:
-        """Return True if the diagnosis can name all effects that act."""
-        return self.kind in IN_LIBRARY
-
 
 @dataclass(frozen=True, kw_only=True)
 class Truth(Drawn):
@@ -187,9 +181,3 @@ class Record:
     def wrong_name(self) -> bool:
         """Return True if one effect is named, without an alternative, that does not act."""
         return self.verdict == "effect" and self.best is not None and not self.best <= self.truth
-
-
-def pulls(fitted: ArrayLike, true: ArrayLike, errors: ArrayLike) -> tuple[float, ...]:
-    """Return fitted less true components over their errors, without components that the data do not constrain."""
-    difference, sigma = np.asarray(fitted) - np.asarray(true), np.asarray(errors)
-    return tuple(float(value) for value in difference[sigma > 0.0] / sigma[sigma > 0.0])

@@ -8,14 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import tomli_w
-
 from mcsim import config
 from mcsim.benchmark import folder as files
 from mcsim.benchmark.case import Drawn, Member, Truth
 from mcsim.benchmark.folder import Settings
 from mcsim.benchmark.models import LearnedModel, learned_model, workers_of
 from mcsim.benchmark.sampler import CaseSampler
+from mcsim.config.load import to_toml
 from mcsim.datavector.campaign import Batch, seeded, with_effects
 from mcsim.datavector.map_checks import of_pixel_means, read_maps
 from mcsim.datavector.out_of_library import library_with, responses
@@ -109,8 +108,7 @@ def make_case(settings: Settings, folder: Path, truth: Truth) -> None:
     with appearing(folder / files.MAPS / case) as scratch:
         for name, map_uk in maps_of(run, truth, settings.out_of_library):
             write_map(scratch / names[name], map_uk, config.prepared_grid(run)[1], [POINTING[truth.sampled]])
-        plain = {**config.to_dict(run), "name": case}
-        (scratch / files.MODEL).write_text(tomli_w.dumps(_without_none(plain)), encoding="utf-8")
+        (scratch / files.MODEL).write_text(to_toml(replace(run, name=case)), encoding="utf-8")
         (scratch / files.QUESTION).write_text(json.dumps({"without": list(truth.without)}) + "\n")
         (scratch / files.SEAL).write_text(f"{files.key_hash(folder, case)}  {files.KEYS}/{case}.json\n")
         if not files.is_whole(folder, case, names.values()):
@@ -151,13 +149,6 @@ def _measured(model: LearnedModel, member: Member, seed: int) -> Member:
             strength = model.expected_snr_on_sky(candidate.table(effect), seed)
         return replace(member, parameters=parameters, coordinates=coordinates, strength=strength)
     raise InputError(f"effect {member.name} can have no amplitude that is strong enough; leave it out.")
-
-
-def _without_none(value: Any) -> Any:
-    """Return nested tables without what is None or an empty list: TOML has neither."""
-    if isinstance(value, dict):
-        return {key: _without_none(one) for key, one in value.items() if one is not None and one != []}
-    return [_without_none(one) for one in value] if isinstance(value, list) else value
 
 
 def run(folder: str | Path, *, workers: Workers | None = None, quiet: bool = True) -> int:

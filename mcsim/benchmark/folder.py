@@ -3,7 +3,7 @@
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,8 @@ from mcsim import config, systematics
 from mcsim.benchmark.case import Member, Prior, Truth
 from mcsim.datavector.out_of_library import load
 from mcsim.errors import InputError
-from mcsim.support.folders import not_a_file, write_once
+from mcsim.support.folders import not_a_file, read_json, write_once
+from mcsim.support.numbers import some
 
 NO_KEY = "restore it, or make another challenge in a new folder"
 SETTINGS, MAPS, KEYS, SEAL, VERDICTS = "challenge.json", "cases", "keys", "SEAL", "verdicts"
@@ -109,14 +110,6 @@ def _changes(old: Any, text: str) -> list[str]:
     return config.differences(*kept)
 
 
-def read_json(path: Path, remedy: str) -> Any:
-    """Read a JSON file; InputError with the remedy if it is missing or malformed."""
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read ({error}); {remedy}.") from error
-
-
 def key_path(folder: Path, case: str) -> Path:
     """Return the path of the key of a case."""
     return folder / KEYS / f"{case}.json"
@@ -209,8 +202,8 @@ def all_cases(folder: Path) -> list[str]:
     known |= {path.name for path in (folder / VERDICTS).glob("case-*")}
     if lost := sorted(known - set(found)):
         raise InputError(
-            f"{folder / MAPS} lacks {listed(lost)}, maps or {SEAL}, and a score without them would be of chosen cases; "
-            "restore them, or give mcsim challenge make again."
+            f"{folder / MAPS} lacks {some(lost, 5)}, maps or {SEAL}, and a score without them would be of chosen "
+            "cases; restore them, or give mcsim challenge make again."
         )
     return found
 
@@ -219,11 +212,6 @@ def check_keys(folder: Path, cases: Iterable[str]) -> None:
     """Raise InputError if finished cases have no key: one with another nonce would not be the sealed one."""
     if lost := [case for case in cases if is_finished(folder, case) and not key_path(folder, case).is_file()]:
         raise InputError(
-            f"{folder / KEYS} lacks the keys of {listed(lost)}, which cannot be made again; restore them, or make "
+            f"{folder / KEYS} lacks the keys of {some(lost, 5)}, which cannot be made again; restore them, or make "
             "another challenge in a new folder."
         )
-
-
-def listed(cases: Sequence[str]) -> str:
-    """Return the names of the first cases, and how many there are more."""
-    return ", ".join(cases[:5]) + (f" and {len(cases) - 5} more" if len(cases) > 5 else "")

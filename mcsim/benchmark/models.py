@@ -12,7 +12,7 @@ from mcsim import config
 from mcsim.benchmark.case import Identity, Member
 from mcsim.benchmark.folder import Settings
 from mcsim.datavector.analysis import Job, analysis_of, data_vectors
-from mcsim.datavector.campaign import PER_TASK, Ask, Batch, after_jobs, asking, batch, reduced, seeded, with_effects
+from mcsim.datavector.campaign import Ask, Batch, after_jobs, asking, batch, in_tasks, reduced, seeded, with_effects
 from mcsim.datavector.candidate import Candidate, columns_of, coordinates_of, effects_at
 from mcsim.datavector.halves import Halves
 from mcsim.datavector.settings import DiagnosisSettings
@@ -25,7 +25,7 @@ from mcsim.sphere import rng
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
-from mcsim.support.arrays import Matrix, Vector
+from mcsim.support.arrays import Matrix, Vector, divided
 
 SKIES = 6  #: skies that an expected S/N is the mean of
 
@@ -68,19 +68,15 @@ class EffectsLibrary:
     def cosines(self, response: Vector) -> Vector:
         """Return the cosine of a response, shape (p_raw,), with the span of each candidate, shape (candidates,)."""
         white = self.null.whiten_templates(response)
-        size = float(np.linalg.norm(white))
-        return np.sqrt(self.groups.delta_chi2(white)) / size if size > 0.0 else np.zeros(len(self.candidates))
+        return divided(np.sqrt(self.groups.delta_chi2(white)), np.linalg.norm(white))
 
     def distances(self, response: Vector) -> tuple[float, ...]:
         """Return the S/N that the best sets of one, two and three candidates leave of a response."""
         white = self.null.whiten_templates(response)
         search = Subsets(self.null, white, self.groups, self.candidates, self.calibration)
-        found, best = [], search.total
-        for size in (1, 2, 3):
-            left = [search.solve(rows).chi2.min() for rows in search.rows(size)]
-            best = min([best, *left])
-            found.append(float(np.sqrt(self.null.hartlap_factor * max(best, 0.0))))
-        return tuple(found)
+        each = [[search.solve(rows).chi2.min() for rows in search.rows(size)] for size in (1, 2, 3)]
+        left = np.minimum.accumulate([min([search.total, *chi2]) for chi2 in each])
+        return tuple(np.sqrt(self.null.hartlap_factor * np.maximum(left, 0.0)).tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,8 +129,7 @@ def simulated(known: DiagnosisContext, number: int, seed: int, ask: Ask) -> Matr
     """Simulate data vectors without effects that no covariance knows, shape (number, p_raw)."""
     run = seeded(known.run, int(rng.generator(seed, 0, "challenge/draws").integers(2**40, 2**62)))
     job = replace(known.analysis.job(run), nuisances=bool(run.nuisances))
-    starts = range(0, number, PER_TASK)
-    return np.concatenate(ask([replace(job, first=first, count=min(PER_TASK, number - first)) for first in starts]))
+    return np.concatenate(ask(in_tasks(job, range(number))))
 
 
 @dataclass(frozen=True, eq=False)

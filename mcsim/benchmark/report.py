@@ -14,6 +14,7 @@ from scipy import stats
 
 from mcsim import systematics
 from mcsim.benchmark.summary import ALPHA, FAR, NAMED, REDUCED, Confusion, Score, confusion
+from mcsim.plot.cells import write_cells
 from mcsim.stats.intervals import Metric, binomial_interval
 from mcsim.support import page
 from mcsim.support.folders import filling, replacing
@@ -52,7 +53,6 @@ def write(score: Score, folder: Path) -> None:
             ("Diagnosis, cases whose truth is in the library", in_library),
         ],
         picture=page.embedded(picture),
-        version=version("mcsim"),
     )
     with filling(folder), replacing(folder, "score.json") as scratch:
         (scratch / "score.png").write_bytes(picture)
@@ -221,10 +221,7 @@ def _matrix(axes: Axes, matrix: Confusion, title: str) -> None:
         return
     shares = matrix.counts / matrix.counts.sum(axis=1, keepdims=True)
     axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
-    for (i, j), count in np.ndenumerate(matrix.counts):
-        if count:
-            colour = "w" if shares[i, j] > 0.5 else "k"
-            axes.text(j, i, str(count), ha="center", va="center", fontsize=8, color=colour)
+    write_cells(axes, ((cell, str(count)) for cell, count in np.ndenumerate(matrix.counts) if count), shares > 0.5, 8)
     style: dict[str, Any] = {"fontsize": 8, "parse_math": False}
     axes.set_xticks(range(len(matrix.answers)), map(_words, matrix.answers), rotation=90, **style)
     axes.set_yticks(range(len(matrix.truths)), map(_words, matrix.truths), **style)

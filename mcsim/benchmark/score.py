@@ -7,20 +7,11 @@ from typing import Any, get_args
 
 import numpy as np
 
+from mcsim.benchmark import folder as files
 from mcsim.benchmark import report
 from mcsim.benchmark.bayes import BayesClassifier, facts
-from mcsim.benchmark.case import Drawn, Prior, Record, Truth, pulls
-from mcsim.benchmark.folder import (
-    MAPS,
-    QUESTION,
-    VERDICTS,
-    Settings,
-    all_cases,
-    is_answered,
-    open_key,
-    question,
-    read_json,
-)
+from mcsim.benchmark.case import Drawn, Prior, Record, Truth
+from mcsim.benchmark.folder import Settings
 from mcsim.benchmark.models import EffectsLibrary, LinearModel, learned_model, linear_model, simulated, workers_of
 from mcsim.benchmark.sampler import CaseSampler
 from mcsim.benchmark.summary import ALPHA, Power, Score
@@ -33,9 +24,10 @@ from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
 from mcsim.sphere import rng
 from mcsim.stats.detection import power
+from mcsim.stats.intervals import pulls
 from mcsim.stats.look_elsewhere import GlobalTest, global_test
 from mcsim.support.arrays import Matrix, Vector
-from mcsim.support.folders import not_a_file, user_path, writable
+from mcsim.support.folders import not_a_file, not_filled, read_json, user_path, writable
 
 CASES_PER_TASK = 20
 DETECTIONS = 4000  #: draws of single effects that are tested for detection alone
@@ -52,11 +44,11 @@ def score(folder: str | Path, *, workers: Workers | None = None, quiet: bool = T
     """
     target = user_path(folder)
     not_a_file(target / "score")
-    made = all_cases(target)
-    cases = [case for case in made if is_answered(target, case)]
+    made = files.all_cases(target)
+    cases = [case for case in made if files.is_answered(target, case)]
     if not cases:
         raise InputError(f"{folder} has no verdicts; run mcsim challenge run {folder} first.")
-    settings, truths = Settings.read(target), [open_key(target, case) for case in cases]
+    settings, truths = Settings.read(target), [files.open_key(target, case) for case in cases]
     for truth in truths:
         _check_question(settings, target, truth)
     with workers_of(settings, workers, quiet):
@@ -64,7 +56,7 @@ def score(folder: str | Path, *, workers: Workers | None = None, quiet: bool = T
     bayes = BayesClassifier(CaseSampler(settings.prior, learned_model(settings)))
     # Cases of one library after each other: a smaller library takes a second.
     order = sorted(truths, key=lambda truth: truth.without)
-    records = [_record(settings, truth, target / VERDICTS / truth.case, bayes) for truth in order]
+    records = [_record(settings, truth, target / files.VERDICTS / truth.case, bayes) for truth in order]
     others = f" of {len(made)}; the others have no verdict" if len(cases) < len(made) else ""
     result = Score(f"{len(cases)} full skies{others}", sorted(records, key=lambda record: record.case))
     report.write(result, target / "score")
@@ -88,8 +80,7 @@ def score_draws(
     if number < 1:
         raise InputError(f"a score of {number} draws is none; ask for at least 1.")
     target = user_path(folder)
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"{target} is not a new folder, and nothing is written over; choose another folder with -o.")
+    not_filled(target)
     writable(target)
     with workers_of(settings, workers, quiet) as call:
         context = learned_model(settings).context
@@ -104,12 +95,12 @@ def score_draws(
 
 def _check_question(settings: Settings, folder: Path, truth: Truth) -> None:
     """Raise InputError unless a case was diagnosed without the effects that its key leaves out."""
-    asked = question(settings, folder, truth.case)
+    asked = files.question(settings, folder, truth.case)
     if set(asked) != set(truth.without):
         said, own = (", ".join(names) or "nothing" for names in (asked, truth.without))
         raise InputError(
-            f"{folder / MAPS / truth.case / QUESTION} leaves out {said}, but the key {own}; restore it, delete "
-            f"{folder / VERDICTS / truth.case} and run mcsim challenge run again."
+            f"{folder / files.MAPS / truth.case / files.QUESTION} leaves out {said}, but the key {own}; restore it, "
+            f"delete {folder / files.VERDICTS / truth.case} and run mcsim challenge run again."
         )
 
 
@@ -139,15 +130,13 @@ def _said(
 ) -> dict[str, Any]:
     """Return what a record says of the verdict."""
     sets = [verdict["effects"], *verdict["alternatives"]] if verdict["effects"] else []
-    reduction = verdict["shrink"] or {}
     return {
         "p_value": _probability(verdict["gap"]["p_value"]),
         "maximum": _probability(answer["maximum"]),
         "verdict": _word(verdict["verdict"]),
         "answers": tuple(frozenset((effect["name"], effect["channel"]) for effect in one) for one in sets),
         "pulls": _pulls(truth, verdict, answer, library),
-        **{key: reduction.get(key) for key in ("predicted", "achieved", "sigma")},
-        "gaps": (reduction["gap_before"], reduction["gap_after"]) if reduction else None,
+        **_reduction(verdict["shrink"]),
         "places": tuple((place["frame"], place["L"], place["parity"]) for place in verdict["where"][:3]),
     }
 
@@ -237,6 +226,7 @@ def judge(model: LinearModel, prior: Prior, seed: int, cases: Sequence[Draw]) ->
         x = model.data[draw.number % len(model.data)] + draw.response
         said = attribute(model.null, x, model.templates, model.candidates, model.calibration)
         said = said.if_named(DiagnosisSettings())
+        reduction = model.held_out_reduction(x, said.explanations[0].members) if said.explanations else None
         record = Record(
             case=f"draw-{draw.number:05d}",
             strength=model.null.expected_snr(draw.response),
@@ -247,7 +237,7 @@ def judge(model: LinearModel, prior: Prior, seed: int, cases: Sequence[Draw]) ->
             absent=_absent(model, draw, x, seed),
             **facts(draw.drawn, x, draw.response, model, bayes),
             **_fitted(said, draw.drawn),
-            **_reduction(model, x, said),
+            **_reduction(None if reduction is None else reduction.to_json()),
         )
         found.append(record)
     return found
@@ -265,17 +255,12 @@ def _fitted(said: Attribution, drawn: Drawn) -> dict[str, Any]:
     return {"pulls": fitted if named else (), "fitted": fitted}
 
 
-def _reduction(model: LinearModel, x: Vector, said: Attribution) -> dict[str, Any]:
-    """Return the reduction of the excess chi^2 of held-out data by the effects that are named first."""
-    found = model.held_out_reduction(x, said.explanations[0].members) if said.explanations else None
-    if found is None:
+def _reduction(shrink: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return what a record says of a reduction as ``verdict.json`` has it; nothing if it was not measured."""
+    if not shrink:
         return {}
-    return {
-        "predicted": found.predicted.value,
-        "achieved": found.achieved.value,
-        "sigma": found.achieved.sigma,
-        "gaps": (found.before.value, found.after.value),
-    }
+    kept = {key: shrink.get(key) for key in ("predicted", "achieved", "sigma")}
+    return {**kept, "gaps": (shrink["gap_before"], shrink["gap_after"])}
 
 
 def _absent(model: LinearModel, draw: Draw, x: Vector, seed: int) -> tuple[float, float] | None:

@@ -1,6 +1,5 @@
 """One self-contained page about a comparison: what differs, in maps, by degree and by hits."""
 
-from importlib.metadata import version
 from pathlib import Path
 
 import healpy
@@ -29,7 +28,6 @@ def page(result: ComparisonResult) -> str:
         {"number": number},
         result=result,
         pictures=pictures,
-        version=version("mcsim"),
     )
 
 

@@ -1,4 +1,4 @@
-"""Read a run from TOML or a dict, and write it as JSON for a worker."""
+"""Read a run from TOML or a dict, and write it as TOML, or as JSON for a worker."""
 
 import json
 import os
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 from pydantic import TypeAdapter, ValidationError
 
 from mcsim.config import arrays, paths
@@ -120,6 +121,18 @@ def resolved(config: RunConfig) -> dict[str, Any]:
 def prepared_grid(config: RunConfig) -> tuple[int, str]:
     """Return nside (0 without pixels) and frame of the maps after their preparation."""
     return grid_after(config.preparation, config.map.resolution, config.map.frame)
+
+
+def to_toml(config: RunConfig) -> str:
+    """Return TOML that :func:`load` reads; it has neither what is None nor empty lists."""
+    return tomli_w.dumps(_filled(to_dict(config)))
+
+
+def _filled(value: Any) -> Any:
+    """Return nested tables without what is None or an empty list."""
+    if isinstance(value, dict):
+        return {key: _filled(one) for key, one in value.items() if one is not None and one != []}
+    return [_filled(one) for one in value] if isinstance(value, list) else value
 
 
 def to_json(config: RunConfig) -> str:

@@ -141,14 +141,14 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
     known = all(channel.site.pointing is not None for channel in analysis.model.survey.channels)
     if time_ordered and analysis.of_maps and known:
         quiet = replace(base.unfiltered(), channels=tuple(c.without_noise() for c in base.channels))
-        for job in _split(analysis.job(quiet), range(_scaled(analysis, settings.time_ordered_skies)), 1):
+        for job in in_tasks(analysis.job(quiet), range(_scaled(analysis, settings.time_ordered_skies)), 1):
             jobs[Purpose("time-ordered", job.first)] = replace(job, sample_by_sample=True)
             jobs[Purpose("default", job.first)] = job
-    for job in _split(analysis.job(seeded(run, _COVARIANCE)), range(wanted)):
+    for job in in_tasks(analysis.job(seeded(run, _COVARIANCE)), range(wanted)):
         drawn = replace(job, nuisances=bool(run.nuisances), bipolar_scan=job.first < settings.scan_sims)
         jobs[Purpose("null", job.first)] = replace(drawn, source=analysis.source)
     own = analysis.source_of(())
-    for job in _split(analysis.job(base), range(settings.noisy_skies)):
+    for job in in_tasks(analysis.job(base), range(settings.noisy_skies)):
         jobs[Purpose("reference", job.first)] = job
         if own is not None:
             jobs[Purpose("external reference", job.first)] = replace(job, source=own)
@@ -191,7 +191,7 @@ def is_of_the_model(job: Job) -> bool:
     return config.from_json(job.simulated).ensemble.seed == _COVARIANCE
 
 
-def _split(job: Job, realizations: range, size: int = PER_TASK) -> list[Job]:
+def in_tasks(job: Job, realizations: range, size: int = PER_TASK) -> list[Job]:
     """Return jobs of at most ``size`` of these realizations each."""
     stop = realizations.stop
     return [replace(job, first=first, count=min(size, stop - first)) for first in range(realizations.start, stop, size)]
@@ -395,14 +395,14 @@ def after_jobs(analysis: Analysis, found: Sequence[config.Effect], skies: int | 
     """List two jobs that simulate the model with effects, over the skies with which responses are measured."""
     total = analysis.settings.noisy_skies if skies is None else skies
     job = replace(_with(analysis, found), source=analysis.source_of(found))
-    return _split(job, range(total), -(-total // 2))
+    return in_tasks(job, range(total), -(-total // 2))
 
 
 def constrained_jobs(
     analysis: Analysis, found: Sequence[config.Effect], observed: NDArray[np.complex128], realizations: range
 ) -> list[Job]:
     """List jobs that simulate the model with effects, over skies that are constrained by an observed one."""
-    return _split(replace(_with(analysis, found), observed=observed), realizations, _CONSTRAINED_PER_TASK)
+    return in_tasks(replace(_with(analysis, found), observed=observed), realizations, _CONSTRAINED_PER_TASK)
 
 
 def _with(analysis: Analysis, found: Sequence[config.Effect]) -> Job:

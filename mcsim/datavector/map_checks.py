@@ -18,6 +18,7 @@ from mcsim.sphere.header import first_table, opened
 from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Map
 from mcsim.support.folders import user_path
+from mcsim.support.numbers import some
 
 
 def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
@@ -108,15 +109,9 @@ def of_pixel_means(model: Model, folder: str | Path) -> bool:
     return True
 
 
-def _listed(names: Iterable[str]) -> str:
-    """Return names in alphabetic order, at most three of them."""
-    found = sorted(names)
-    return ", ".join(found[:3]) + (f" and {len(found) - 3} more" if len(found) > 3 else "")
-
-
 def _warn_of_others(names: Iterable[str]) -> None:
     """Warn of what stands beside the maps, and may be one that the model should have."""
-    if found := _listed(names):
+    if found := some(sorted(names), 3):
         warnings.warn(
             f"{found} in the data will not be looked at: no map of the model has that name; if it "
             "is an observed map, give the model its channel or split.",
@@ -144,8 +139,8 @@ def _read(run: config.RunConfig, folder: str | Path) -> dict[str, Map]:
             inside = first_realization(folder)
             remedy = "give it under that name" if inside == folder else f"give the folder of a realization, {inside}"
             known = names.values()
-            other = _listed(each.name for each in folder.iterdir() if each.is_file() and each.name not in known)
-            beside = f" (the folder has {other})" if other else ""
+            others = sorted(each.name for each in folder.iterdir() if each.is_file() and each.name not in known)
+            beside = f" (the folder has {some(others, 3)})" if others else ""
             raise InputError(f"{path} does not exist; the model has a map {part.name}, {remedy}{beside}.")
         found[str(path)] = read_uk(path, part.frame, part.frequency_ghz)
         _check_size(run, found[str(path)], str(path))

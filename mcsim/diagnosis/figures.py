@@ -13,6 +13,7 @@ from mcsim.datavector.summaries import KINDS
 from mcsim.diagnosis.control_result import Controls
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Contrast
+from mcsim.plot.cells import write_cells
 from mcsim.plot.sky import mollweide
 from mcsim.stats.detection import snr_to_separate
 from mcsim.support.numbers import measured, p_equals
@@ -101,10 +102,8 @@ def blocks_figure(result: DiagnosisResult) -> Figure:
         table[tuple(at[order].T)] = z[order]
         axes.set_facecolor("#e6e6e6")
         shown = axes.imshow(table, cmap="RdBu_r", vmin=-LIMIT, vmax=LIMIT, aspect="auto")
-        for (row, column), value in np.ndenumerate(table):
-            if np.isfinite(value):
-                colour = "white" if abs(value) > 0.62 * LIMIT else "black"
-                axes.text(column, row, f"{value:+.1f}", ha="center", va="center", fontsize=7, color=colour)
+        numbers = ((cell, f"{value:+.1f}") for cell, value in np.ndenumerate(table) if np.isfinite(value))
+        write_cells(axes, numbers, np.abs(table) > 0.62 * LIMIT, 7)
         labels = [_label(name, 22) for name in names]
         axes.set_xticks(range(len(names)), labels, rotation=45, ha="right", fontsize=8)
         axes.set_yticks(range(len(kinds)), [_label(kind, 80) for kind in kinds], fontsize=8)

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,6 @@ def page(result: DiagnosisResult) -> str:
         places=PLACES,
         pictures=_pictures(result),
         configuration=json.dumps(json.loads(result.configuration), indent=2, ensure_ascii=False),
-        version=version("mcsim"),
     )
 
 

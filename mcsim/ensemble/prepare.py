@@ -18,7 +18,7 @@ from mcsim.sphere import spectra
 from mcsim.sphere.checks import UNSEEN_BELOW, check_map, check_not_infinite
 from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Map, reals
-from mcsim.support.folders import appearing, unwritable, user_path, writable
+from mcsim.support.folders import appearing, not_filled, unwritable, user_path, writable
 
 SMALLEST_RMS = 2e-3
 """Rms of an observed map over that of the sky of the run, at least: above a map in mK or K that is taken for uK."""
@@ -132,8 +132,7 @@ def prepare_files(source: Source, files: Sequence[str], folder: str | Path) -> l
     """
     run = config.load(source)
     target, names = user_path(folder), file_names(run)
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"{target} is not a new folder, and nothing is written over; choose another folder with -o.")
+    not_filled(target)
     read: dict[str, Map] = {}
     for file in files:
         name, map_uk = _read(run, names, file)

@@ -15,7 +15,7 @@ from scipy.sparse import csr_matrix, diags
 
 from mcsim import config
 from mcsim.datavector.analysis import Analysis, Job, Kinds, analysis_for, simulated_maps
-from mcsim.datavector.campaign import Ask, seeded
+from mcsim.datavector.campaign import Ask, in_tasks, seeded
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import FilteredMaps, Model, sky_variance, wiener_filter
 from mcsim.instrument.scan import MapGrid
@@ -59,8 +59,6 @@ all choices of one data set."""
 SPREAD = 40  #: simulations by which the variance of the scores of sources is known
 
 SEED = 0x6D63 * 1_000 + 4  #: of these simulations; those of the data vector and of the controls have others
-
-PER_TASK = 10
 
 SUBTRACTED = 0.03  #: scatter of the score of a coordinate over the largest, up to which maps do not have it
 
@@ -380,8 +378,6 @@ def null_scores(analysis: Analysis, ask: Ask, chosen: tuple[str, ...] = ()) -> M
 
     def fill(folder: Path) -> None:
         job = replace(analysis.job(seeded(run, SEED)), nuisances=bool(run.nuisances), chosen=chosen)
-        starts = range(0, SIMULATIONS, PER_TASK)
-        jobs = [replace(job, first=k, count=min(PER_TASK, SIMULATIONS - k)) for k in starts]
-        write_npy(folder / "scores.npy", np.concatenate(ask(jobs)))
+        write_npy(folder / "scores.npy", np.concatenate(ask(in_tasks(job, range(SIMULATIONS)))))
 
     return np.asarray(np.load(folders.cached(f"diagnose/unlisted-{key}", fill) / "scores.npy"))

@@ -53,6 +53,12 @@ def share(name: str, hits: Sequence[bool] | NDArray[np.bool_]) -> Metric:
     return Metric(name, n, k / n if n else np.nan, *binomial_interval(k, n))
 
 
+def pulls(fitted: ArrayLike, true: ArrayLike, errors: ArrayLike) -> tuple[float, ...]:
+    """Return fitted less true components over their errors, without components that the data do not constrain."""
+    difference, sigma = np.asarray(fitted) - np.asarray(true), np.asarray(errors)
+    return tuple(float(value) for value in difference[sigma > 0.0] / sigma[sigma > 0.0])
+
+
 def mean(name: str, values: Sequence[float] | Vector) -> Metric:
     """Return the mean of at least two values, with its Student interval."""
     n = len(values)

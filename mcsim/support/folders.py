@@ -114,6 +114,12 @@ def not_a_file(path: Path) -> None:
             return
 
 
+def not_filled(folder: Path) -> None:
+    """Raise InputError unless a folder is empty, or is not there yet."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder} is not a new folder, and nothing is written over; choose another folder with -o.")
+
+
 def outside_stores(path: Path, filled: bool = False) -> None:
     """Raise InputError for a path within a Zarr store, which would no longer be what it was.
 
@@ -176,6 +182,14 @@ def unreadable(name: str | Path, what: str, remedy: str) -> Iterator[None]:
         raise
     except Exception as error:  # of any type
         raise InputError(f"{name} cannot be read as {what} ({error}); {remedy}.") from error
+
+
+def read_json(path: Path, remedy: str) -> Any:
+    """Read a JSON file; InputError with the remedy if it is missing or malformed."""
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read ({error}); {remedy}.") from error
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

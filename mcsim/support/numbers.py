@@ -1,6 +1,7 @@
-"""Numbers in text: a value with its error, three digits, powers of ten."""
+"""Numbers and names in text: a value with its error, three digits, powers of ten; the first of many names."""
 
 import math
+from collections.abc import Sequence
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -45,6 +46,11 @@ def duration(seconds: float) -> str:
     units = (("d", 86400.0, 2.0), ("h", 3600.0, 2.0), ("min", 60.0, 2.0), ("s", 1.0, 1.0), ("ms", 1e-3, 0.0))
     name, size = next((name, size) for name, size, least in units if seconds >= least * size)
     return f"{number(seconds / size)} {name}"
+
+
+def some(names: Sequence[str], most: int) -> str:
+    """Return the first names, and how many there are more."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def probability(value: float) -> str:

@@ -3,6 +3,7 @@
 import base64
 import io
 from collections.abc import Callable, Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,10 @@ def embedded(picture: bytes) -> str:
 
 
 def render(template: Path, filters: Mapping[str, Callable[..., Any]], **values: Any) -> str:
-    """Fill in a jinja2 template; whatever comes from outside it is escaped, and a name that it lacks is an error."""
+    """Fill in a jinja2 template: values by name, and the ``version`` of mcsim.
+
+    Whatever comes from outside it is escaped, and a name that it lacks is an error.
+    """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(template.parent),
         autoescape=True,
@@ -34,4 +38,4 @@ def render(template: Path, filters: Mapping[str, Callable[..., Any]], **values: 
         lstrip_blocks=True,
     )
     environment.filters |= filters
-    return environment.get_template(template.name).render(**values)
+    return environment.get_template(template.name).render(version=version("mcsim"), **values)

@@ -9,7 +9,7 @@ from scipy import integrate, stats
 
 from mcsim import config, systematics
 from mcsim.benchmark.bayes import BayesClassifier
-from mcsim.benchmark.case import Drawn, Member, Prior, Record, pulls
+from mcsim.benchmark.case import Drawn, Member, Prior, Record
 from mcsim.benchmark.models import linear_model, simulated
 from mcsim.benchmark.report import lines, write
 from mcsim.benchmark.sampler import CaseSampler
@@ -23,6 +23,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Block, Element
 from mcsim.diagnosis.context import context
 from mcsim.errors import InputError
+from mcsim.stats.intervals import pulls
 from mcsim.stats.look_elsewhere import global_test
 from mcsim.systematics.signatures import SIGNATURES, any_place_right
 from refusals import refused

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 
 from mcsim import config
 from mcsim.benchmark import challenge
 from mcsim.benchmark.case import Member, Truth
-from mcsim.benchmark.challenge import _without_none, make, make_case, maps_of, run
+from mcsim.benchmark.challenge import make, make_case, maps_of, run
 from mcsim.benchmark.folder import (
     MAPS,
     SEAL,
@@ -30,6 +29,7 @@ from mcsim.benchmark.folder import (
     write_key,
 )
 from mcsim.benchmark.score import score, score_draws
+from mcsim.config.load import to_toml
 from mcsim.errors import InputError
 from mcsim.support.folders import write_whole
 from refusals import refused
@@ -269,7 +269,7 @@ def test_a_run_in_toml_loads_as_the_same_run(name):
     run = config.load("quickstart")
     effect = config.Effect(name="beam_width", channel=run.channels[0].name, parameters={"amplitude": 0.01})
     run = replace(run, name=name, effects=(effect,))
-    assert config.load(tomllib.loads(tomli_w.dumps(_without_none(config.to_dict(run))))) == run
+    assert config.load(tomllib.loads(to_toml(run))) == run
 
 
 def test_a_folder_in_the_home_is_found_there(folder, monkeypatch):
