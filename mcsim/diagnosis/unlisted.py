@@ -96,8 +96,9 @@ def reduction_of(
     matrix, told = data.halves()
     if (halves := Halves.of(context.ensemble.remix(matrix), matrix @ data.x)) is None:
         return None
-    t = np.stack([matrix @ (made.simulated([one], tested=True).x - made.before.x) for one in first], axis=1)
-    if halves.expected_snr(t.sum(axis=1)) < settings.half_snr_share * context.null.expected_snr(t.sum(axis=1)):
+    t = np.stack([made.simulated([one], tested=True).x - made.before.x for one in first], axis=1)
+    snr, t = context.null.expected_snr(t.sum(axis=1)), matrix @ t
+    if halves.expected_snr(t.sum(axis=1)) < settings.half_snr_share * snr:
         return None
 
     def respond(frozen: Fit) -> Vector:
