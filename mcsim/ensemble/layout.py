@@ -112,6 +112,15 @@ class Layout:
         shapes = [(np.dtype(dtype), [sizes[dim] for dim in dims]) for dims, dtype, _, _ in self.variables().values()]
         return sum(dtype.itemsize * math.prod(shape) for dtype, shape in shapes)
 
+    def statistics_bytes(self) -> int:
+        """Return the size of the statistics of any number of realizations in bytes, as a summary is made of them."""
+        sizes = self.sizes()
+        spectra, bins = sizes["pair"] * sizes["mode"], sizes["bin"]
+        # A mean, a sum of squares, and of binned spectra their products: of maps, controls and differences.
+        raw = (16 + 8) * spectra * sizes["ell"] + (8 + 8) * sizes["pair"] * sizes["ell"]
+        binned = (1 + self.filtered) * (16 + 8 + 16 * bins) * spectra * bins
+        return (1 + 2 * self.paired) * (raw + binned)
+
     def files(self) -> int:
         """Return the number of files of the finished store, coordinates and metadata included."""
         chunks = -(-self.realizations // self.chunk)

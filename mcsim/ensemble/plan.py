@@ -37,6 +37,15 @@ from mcsim.support.progress import reporting
 SOLUTION, NEAR = 100.0, 0.7
 """Transforms that a solution of the inverse covariance takes, about, and the share of them with a near one known."""
 
+BASE, COMMAND = 3e8, 4.2e8
+"""Memory in bytes of a worker and of the process that drives it without what they calculate, about."""
+
+SUMMING = 8
+"""Statistics that each of them holds besides those of the tree of sums: results on their way, and copies of them."""
+
+DRAWING = 24
+"""Fisher matrices of a pair that are held at once, about, while they are estimated from random maps by two threads."""
+
 CHUNKS = 128
 CHUNK_BYTES = 1 << 26
 
@@ -207,7 +216,7 @@ class Cost:
     each_s: float
     parts: tuple[tuple[str, str], ...]
     once_s: float = 0.0  #: processor time of what all realizations share
-    driver: float = 4e8  #: memory of the process that drives the workers, in bytes
+    driver: float = COMMAND  #: memory of the process that drives the workers, in bytes
 
     def lines(self, number: int, workers: int) -> list[str]:
         """Return lines on memory, parts and time for a number of realizations."""
@@ -326,8 +335,7 @@ def cost(run: config.RunConfig) -> Cost:
     transforms = sum(1.0 + 2.0 * m + splits * (2.0 + 4.0 * run.biposh.iterations) for m in mmax)
     if run.map.grid == "gl":
         transforms = sum(2.0 * m for m in mmax)
-    memory = 3e8 + 96.0 * nside**2 * (6 + 2 * max(mmax)) + 16.0 * alm_.size(run.sky.lmax) * (6 + len(names) * 2)
-    memory += planned.chunk * planned.realization_bytes()
+    memory, driver = _memory(run, planned, nside, max(mmax)), COMMAND + SUMMING * planned.statistics_bytes()
     parts = []
     if run.preparation:
         steps = [preparation(run, *one) for one in run.each_map]
@@ -340,26 +348,47 @@ def cost(run: config.RunConfig) -> Cost:
     if order > 1:
         spread = [channel for channel in run.channels if not isinstance(channel.scan, config.ScanParallelTransport)]
         extra = len(spread) * offsets.transforms(order)
-        transforms, memory = transforms + extra, memory + 96.0 * nside**2 * (4 + splits)
+        transforms += extra
         words = f"{extra} further transforms per realization for powers of the samples' offsets up to {order}"
         parts.append(("offsets", words))
     if run.biposh.filtered:
         solutions = len(names) * (1.0 + NEAR * run.ensemble.paired)
         transforms += SOLUTION * solutions
-        bands = [
-            Bands(planned.modes, lmax, run.biposh.summary_bin, auto) for auto in {True, not (both and len(names) > 1)}
-        ]
-        probes = probes_of(bands, run.biposh.probes)
+        autos = [True] * len(names) + [False] * (pairs - len(names))
+        bands = {auto: Bands(planned.modes, lmax, run.biposh.summary_bin, auto) for auto in autos}
+        probes = probes_of([*bands.values()], run.biposh.probes)
         once_s = probes * (SOLUTION * len(names) * transform + pairs * probes * estimation)
+        matrices = [8.0 * bands[auto].size ** 2 for auto in autos]
+        memory += 2.0 * (sum(matrices) + max(matrices))
+        driver = max(driver, COMMAND + sum(matrices) + 2.0 * max(matrices))
         words = (
             f"about {SOLUTION * solutions:.0f} further transforms per realization; once, {probes} random maps of each "
-            f"map, {duration(once_s)} of processor time (none if the noise is uniform on the full sky)"
+            f"map, {duration(once_s)} of processor time and {1e-9 * DRAWING * max(matrices):.2g} GB more of the "
+            "command (none if the noise is uniform on the full sky)"
         )
         parts.append(("filter", words))
     parts += [("noise", line) for line in noise.in_words(run)]
     estimates = pairs * (2 if run.ensemble.paired else 1)
     each_s = transform * transforms + estimation * estimates + differencing.seconds(run) + noise.seconds(run)
-    return Cost(planned, memory, each_s, tuple(parts))
+    return Cost(planned, memory, each_s, tuple(parts), driver=driver)
+
+
+def _memory(run: config.RunConfig, planned: Layout, nside: int, mmax: int) -> float:
+    """Return the memory of a worker in bytes: maps, a chunk as computed and as written, and the tree of sums."""
+    splits, order = len(run.map.each_split), max(run.map.offset_order or 1, 1)
+    # Channels that share a scan share its moments: hits, offsets with the products of higher orders, and w_s.
+    scans = {
+        repr(one.scan) if isinstance(one.scan, config.ScanHitAveraged) else one.name
+        for one in run.channels
+        if not isinstance(one.scan, config.ScanParallelTransport)
+    }
+    maps = 3 * len(planned.maps) + len(scans) * splits * (2 * mmax + (order + 1) * (order + 2) // 2)
+    maps += 6 + 2 * mmax + (4 + splits if order > 1 else 0)
+    alms = 6 + 2 * len(planned.maps)
+    leaves = max(planned.chunk, planned.realizations / 16)
+    sums = planned.statistics_bytes() * (np.ceil(np.log2(leaves)) + SUMMING)
+    values = 2.0 * planned.chunk * planned.realization_bytes() + sums
+    return float(BASE + 96.0 * nside**2 * maps + 16.0 * alm_.size(run.sky.lmax) * alms + values)
 
 
 def with_scans(found: Cost, run: config.RunConfig) -> Cost:
