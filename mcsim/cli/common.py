@@ -124,7 +124,8 @@ def picture(asked: Path | None, shown: str | Path, end: str = "") -> Path:
         raise InputError(f"{asked} ends in {asked.suffix or 'nothing'}; choose one of {', '.join(PICTURES)}.")
     source = user_path(shown)
     folder = source.absolute().parent if source.name in ("", "..") else source.parent
-    target = folder / f"{source.absolute().stem}{end}.png" if asked is None else user_path(asked)
+    name = Path(source.absolute().name.removesuffix(".gz")).stem
+    target = folder / f"{name}{end}.png" if asked is None else user_path(asked)
     outside_stores(target)
     with unwritable(target, "choose another file with -o"), TemporaryFile(dir=target.absolute().parent):
         pass

@@ -414,6 +414,9 @@ def test_pictures_come_beside_what_they_show(mcsim: Command, tmp_path: Path) -> 
     assert code == 0
     assert (tmp_path / "sub" / "bl-beam.png").exists()
     assert "sub/bl-beam.png" in out
+    hdu.writeto(tmp_path / "sub" / "packed.fits.gz")
+    assert mcsim("beam", "sub/packed.fits.gz")[0] == 0
+    assert (tmp_path / "sub" / "packed-beam.png").exists()
     assert_refused(mcsim("scan", "wmap", "-o", "nowhere/scan.png"), "nowhere/scan.png")
     assert_refused(mcsim("fit", "nix.zarr", "tiny", "-o", "nowhere/fit.png"), "nowhere/fit.png")
     (tmp_path / "p.zarr").mkdir()
