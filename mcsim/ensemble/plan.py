@@ -195,6 +195,8 @@ def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     changes = config.differences(old["science"], new["science"])
     # The bins of the summary, which earlier versions counted as science, may differ.
     changes = [change for change in changes if not change.startswith("biposh.summary_bin: ")]
+    # Those of filtered maps count, under a name of their own.
+    changes = [change.replace("biposh.bin: ", "biposh.summary_bin: ") for change in changes]
     for key, before, after in (
         ("ensemble.keep_maps", *(a["configuration"]["ensemble"]["keep_maps"] for a in (old, new))),
         ("version of mcsim", *(a["packages"]["mcsim"] for a in (old, new))),
