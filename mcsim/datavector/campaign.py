@@ -17,7 +17,7 @@ from mcsim.datavector.bipolar_scan import rms
 from mcsim.datavector.candidate import Candidate, TemplateBank, numbered
 from mcsim.datavector.kept import Kept
 from mcsim.datavector.null_ensemble import NullEnsemble, without_nuisances
-from mcsim.datavector.repeats import check_distinct, check_fresh
+from mcsim.datavector.repeats import check_alike, check_distinct, check_fresh
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import pair_classes
 from mcsim.ensemble import runner
@@ -248,6 +248,7 @@ def learned(
     null, references = stacked("null"), {False: stacked("reference"), True: stacked("external reference")}
     if analysis.source is not None:
         check_distinct(null[:, :size], analysis.source, _COVARIANCE)
+        check_alike(null[:, :size], analysis.source, _COVARIANCE)
     labels = tuple(label for candidate in analysis.candidates for label in candidate.labels)
     matrix, curvature, error = np.zeros((3, whole, len(labels)))
     for candidate, column, sign, effect in _steps(analysis):

@@ -1,4 +1,4 @@
-"""Refuse realizations of an external simulator that repeat others: a covariance counts each as one of its own."""
+"""Refuse realizations of an external simulator that repeat others, or are none of it: a covariance counts each."""
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -9,6 +9,11 @@ from mcsim.support.arrays import Matrix, Vector, divided
 
 REPEATS = 1e-6
 """Rms difference over the rms up to which two maps or data vectors are the same: threads add numbers in any order."""
+
+ALONE = 0.8
+"""Share of the variance of an element that one realization may make: it then is 2 sqrt(N) standard deviations of the N
+others away. The tails of products of sky and noise make 0.5 of 60 realizations at most, and 0.1 of 600.
+"""
 
 
 def check_distinct(rows: Matrix, source: Source, seed: int) -> None:
@@ -28,6 +33,22 @@ def check_distinct(rows: Matrix, source: Source, seed: int) -> None:
         f"{source.words(seed, first)} and {source.words(seed, again)} are the same; {len(rows)} realizations are asked "
         f"for, and {distinct} of them {'differs' if distinct == 1 else 'differ'}: {remedy}."
     )
+
+
+def check_alike(rows: Matrix, source: Source, seed: int) -> None:
+    """Raise InputError if one of the data vectors, shape (N, p), makes the scatter of an element almost by itself.
+
+    One with a map of another sky does. In the covariance of such a sample nothing departs from the model any more.
+    """
+    squares = (rows - rows.mean(axis=0)) ** 2
+    shares = divided(squares, squares.sum(axis=0)).max(axis=1)
+    worst = int(shares.argmax())
+    if shares[worst] > ALONE:
+        raise InputError(
+            f"{source.words(seed, worst)} is none like the others: it makes {100.0 * shares[worst]:.3g} % of the "
+            f"variance of what is measured in {len(rows)} of them, and {100.0 * ALONE:g} % are the most that one may; "
+            "see if its maps are of one sky and of this survey, or leave it out."
+        )
 
 
 def check_fresh(x: Vector, rows: Matrix, source: Source, seed: int) -> None:

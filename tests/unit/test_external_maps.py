@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 
 from mcsim import config
+from mcsim.datavector.repeats import check_alike
 from mcsim.ensemble.external import source_of
 from mcsim.ensemble.external_maps import Part, fits_maps, in_order
 from mcsim.errors import RunError
@@ -105,6 +106,16 @@ def test_folder_and_numerical_errors_of_a_simulator_are_its_own(
         np.testing.assert_array_equal(source.maps(0, realization), [np.arange(12.0)])
     assert Path.cwd() == tmp_path
     assert np.geterr() == errors
+
+
+def test_a_realization_with_a_map_of_another_is_not_taken_into_the_covariance() -> None:
+    """One of 700 had a map of another sky: the p-value of perfect data was 1."""
+    source = source_of(config.load("tiny"), np.zeros((300, 1, 3072)))
+    rows = np.random.default_rng(3).standard_normal((300, 5))
+    check_alike(np.column_stack([rows, np.zeros(300)]), source, 0)
+    rows[7, 2] = 50.0
+    with refused(7, 300, 80):
+        check_alike(rows, source, 0)
 
 
 @pytest.mark.parametrize("lost", ["V_2.fits", "W_2.fits"])
