@@ -136,8 +136,8 @@ def analysis_of(
     check_nuisances(run, dict(known))
     if source is not None and run.nuisances:
         raise InputError(
-            f"nuisances are drawn by mcsim's simulations, but {source.label} simulates in their place; let it draw "
-            "them, and leave [[nuisance]] out."
+            f"nuisances are drawn by mcsim's simulations, but these are of {source.label}; draw them there, and leave "
+            "[[nuisance]] out."
         )
     declared = _declared(run)
     model = model_of(survey(run, nthreads=nthreads, orders=settings.beam_orders, library=dict(known)), settings)

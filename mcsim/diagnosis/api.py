@@ -217,7 +217,9 @@ def _analysed(
     controls.check(wanted, of_maps=table is None, external=source is not None)
     if table is not None:
         if source is not None:
-            raise InputError(f"{data} is a table, but {source.label} makes maps; give maps, or a run of mcsim.")
+            raise InputError(
+                f"{data} is a table, but the model is of maps, {source.label}; give maps, or a run of mcsim."
+            )
         run = spectra_table.estimator_for(run, table)
         analysis = spectra_table.analysis_of_spectra(run, table, settings.without, threads, settings, library)
     else:

@@ -121,7 +121,7 @@ def agreement(found: Agreement) -> str:
     text = f"mcsim's own simulation of the description {how} with {found.simulator} "
     text += f"({p_equals(found.pvalue)}, {found.skies} skies)"
     if not found.agrees and found.nearest is not None:
-        text += f"; nearest to what {found.simulator} has beside it is {found.nearest}"
+        text += f"; nearest to what is in {found.simulator} beside it is {found.nearest}"
     whose = f"those of {', '.join(found.effects)} are {found.simulator}'s" if found.effects else ""
     how = "" if found.agrees else " and approximate"
     return f"{text}. Responses to effects are mcsim's{how}{f', but {whose}' if whose else ''}."
