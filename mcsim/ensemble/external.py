@@ -29,6 +29,8 @@ SEEDS = 1 << 20  #: realizations of a stream of seeds
 LARGEST = 1 << 16
 """Bytes of a pickled simulator up to which it goes with every task; a larger one is a file in the cache."""
 
+LONGEST = 80  #: characters of what an object says of itself, up to which messages show it
+
 _NO_CHILDREN = "daemonic processes are not allowed to have children"  #: what multiprocessing says (process.py)
 
 _GOLDEN = 2654435769  #: 2^32 over the golden ratio, odd: multiples modulo 2^32 are all different, and far apart
@@ -185,8 +187,11 @@ def _method(simulator: Any) -> Callable[..., Any]:
     found = getattr(simulator, "simulate", simulator)
     if not callable(found):
         shown = repr(simulator)
-        shown = f"a {type(simulator).__name__}" if " at 0x" in shown else shown
-        raise InputError(f"{shown} is no simulator; give a function or an object with simulate(seed, effects=()).")
+        shown = f"a {type(simulator).__name__}" if " at 0x" in shown or len(shown) > LONGEST else shown
+        raise InputError(
+            f"{shown} is no simulator; give a function or an object with simulate(seed, effects=()), or maps as an "
+            "array of shape (realization, map, pixel)."
+        )
     return found
 
 

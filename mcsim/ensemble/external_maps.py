@@ -179,7 +179,8 @@ class StoredMaps(Source):
         """Return an array of the maps of a .npy file, or the dataset of a store."""
         if not self.path.endswith(".npy"):
             return _zarr(self.path)
-        found = np.load(self.path, mmap_mode="r")
+        with unreadable(self.path, "an array of numpy", "write numbers with np.save"):
+            found = np.load(self.path, mmap_mode="r", allow_pickle=False)
         if found.ndim != 3 or found.shape[1] != len(self.parts):
             raise InputError(
                 f"{self.path} has the shape {found.shape}; give (realization, map, pixel), with the "

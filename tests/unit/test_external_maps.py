@@ -118,6 +118,18 @@ def test_a_realization_with_a_map_of_another_is_not_taken_into_the_covariance() 
         check_alike(rows, source, 0)
 
 
+def test_what_holds_no_maps_is_refused_without_its_numbers(tmp_path: Path) -> None:
+    run = config.load("tiny")
+    with refused("list", "simulate(seed, effects=())") as caught:
+        source_of(run, [np.arange(3072.0)] * 4)
+    assert len(str(caught.value)) < 200
+    np.save(tmp_path / "objects.npy", np.array([{}, 1], dtype=object))
+    (tmp_path / "text.npy").write_text("maps")
+    for name in ("objects.npy", "text.npy"):
+        with refused(tmp_path / name, "numpy"):
+            assert source_of(run, tmp_path / name).count
+
+
 @pytest.mark.parametrize("lost", ["V_2.fits", "W_2.fits"])
 def test_a_realization_that_lacks_a_map_is_not_left_out_in_silence(lost: str, tmp_path: Path) -> None:
     """Where it was the first map of the description, one realization fewer was the ensemble."""
