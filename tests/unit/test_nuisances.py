@@ -20,14 +20,7 @@ from mcsim.diagnosis.api import _key, describe
 from mcsim.diagnosis.nuisance_result import results
 from mcsim.information.result import marginalised
 from mcsim.simulation import simulate
-from mcsim.simulation.nuisance import (
-    DisturbedSurvey,
-    Nuisance,
-    check_nuisances,
-    draws,
-    nuisances_of,
-    tables,
-)
+from mcsim.simulation.nuisance import DisturbedSurvey, Nuisance, check_nuisances, draws, nuisances_of, tables
 from mcsim.simulation.survey import survey
 from mcsim.sphere.sky import dipole_alm
 from mcsim.stats.gaussian import SimulatedGaussian
