@@ -64,6 +64,11 @@ class ScannedBeam:
         """Return the highest degree of the moments."""
         return self.w.shape[1] - 1
 
+    def within(self, L_max: int) -> "ScannedBeam":
+        """Return the beam with its moments up to a degree."""
+        beyond = max(self.L_max - L_max, 0)
+        return self if beyond == 0 else ScannedBeam(self.blm, self.w[:, :-beyond, beyond:-beyond])
+
     def response(self, lmax: int) -> NDArray[np.complex128]:
         """Return k_l b_ls for s = -smax..smax, shape (2 smax + 1, lmax + 1), zero beyond the beam's lmax."""
         top = min(lmax, self.blm.shape[1] - 1)

@@ -152,13 +152,17 @@ def noise_biposh(modes: Sequence[Indices], variance: NDArray[np.complex128], lma
 def _checked(
     modes: Sequence[Indices], cl: Cl, lmax: int, x: ScannedBeam, y: ScannedBeam | None
 ) -> tuple[ScannedBeam, ScannedBeam]:
-    """Return both beams; raise InputError for modes that cannot exist, or a spectrum or beam that ends below lmax."""
+    """Return both beams, with the moments that count.
+
+    Raise InputError for modes that cannot exist, or a spectrum or beam that ends below lmax.
+    """
     check_modes(modes)
     check_cl(cl, lmax)
-    y = x if y is None else y
-    for beam in (x, y):
+    for beam in (x, x if y is None else y):
         beam.check(lmax)
-    return x, y
+    top = lmax + len(cl) - 1  # L1 <= l1 + l
+    cut = x.within(top)
+    return cut, cut if y is None or y is x else y.within(top)
 
 
 class _Seen(NamedTuple):
@@ -207,36 +211,40 @@ def _moment_couplings(
     """Yield (L1, L2, X), X[M, s, s'] = sum_{M1 M2} C^{LM}_{L1 M1 L2 M2} w^X_{s,L1 M1} w^Y_{s',L2 M2}."""
     w_x, w_y = x.orientations(), y.orientations()
     for L1 in range(x.L_max + 1):
-        of_x = np.ascontiguousarray(w_x[:, L1])  # of one layout whatever the shape: numba compiles for each
-        for L2 in range(abs(L - L1), min(L + L1, y.L_max) + 1):
-            of_y = np.ascontiguousarray(w_y[:, L2])
-            coupling = np.zeros((len(orders), len(w_x), len(w_y)), dtype=np.complex128)
-            for row, M in zip(coupling, orders, strict=True):
-                _couple((L, M), of_x, of_y, (L1, L2), row)
-            yield L1, L2, coupling
+        degrees = range(abs(L - L1), min(L + L1, y.L_max) + 1)
+        # Of one layout whatever the shape: numba compiles for each.
+        of_x, of_y = np.ascontiguousarray(w_x[:, L1]), np.ascontiguousarray(w_y[:, degrees.start : degrees.stop])
+        couplings = np.zeros((len(orders), len(degrees), len(w_x), len(w_y)), dtype=np.complex128)
+        for rows, M in zip(couplings, orders, strict=True):
+            _couple((L, M), L1, of_x, of_y, rows)
+        for place, L2 in enumerate(degrees):
+            yield L1, L2, couplings[:, place]
 
 
 @njit(nogil=True)
 def _couple(
     mode: tuple[int, int],
+    L1: int,
     w_x: NDArray[np.complex128],
     w_y: NDArray[np.complex128],
-    degrees: tuple[int, int],
-    row: NDArray[np.complex128],
+    rows: NDArray[np.complex128],
 ) -> None:
-    """Add sum_{M1 M2} C^{LM}_{L1 M1 L2 M2} w^X_{s,L1 M1} w^Y_{s',L2 M2} to ``row[s, s']``."""
-    (L, M), (L1, L2) = mode, degrees
-    family = np.zeros(2 * min(L1, L2) + 1)
-    sign = 1.0 if (L1 - L2 + M) % 2 == 0 else -1.0
-    for M1 in range(max(-L1, M - L2), min(L1, M + L2) + 1):
-        left, right = w_x[:, w_x.shape[1] // 2 + M1], w_y[:, w_y.shape[1] // 2 + M - M1]
-        if not (np.any(left != 0.0) and np.any(right != 0.0)):
+    """Add sum_{M1 M2} C^{LM}_{L1 M1 L2 M2} w^X_{s,L1 M1} w^Y_{s',L2 M2} to ``rows[L2 - |L - L1|, s, s']``."""
+    (L, M), first = mode, abs(mode[0] - L1)
+    family = np.zeros(2 * min(L1, L) + 1)
+    # C = (-1)^{L1-L2+M} sqrt(2L+1) (L1 L2 L; M1 M2 -M), and (-1)^{L1+L2+L} for L2 in the first column.
+    factor = np.sqrt(2.0 * L + 1.0) * (1.0 if (L + M) % 2 == 0 else -1.0)
+    for M1 in range(-L1, L1 + 1):
+        left = w_x[:, w_x.shape[1] // 2 + M1]
+        if not np.any(left != 0.0):
             continue
-        lowest, _ = threej_family(L1, L2, M1, M - M1, family)
-        clebsch = sign * np.sqrt(2.0 * L + 1.0) * family[L - lowest]
-        for s in range(len(left)):
-            for t in range(len(right)):
-                row[s, t] += clebsch * left[s] * right[t]
+        lowest, n = threej_family(L1, L, M1, -M, family)
+        for L2 in range(lowest, min(lowest + n, first + w_y.shape[1])):
+            clebsch = factor * family[L2 - lowest]
+            right = w_y[:, L2 - first, w_y.shape[2] // 2 + M - M1]
+            for s in range(len(left)):
+                for t in range(len(right)):
+                    rows[L2 - first, s, t] += clebsch * left[s] * right[t]
 
 
 @njit(nogil=True)
