@@ -78,11 +78,12 @@ class Refiner:
         response is kept, of any other one by how much it scatters the data. Where the power of an effect counts,
         which grows as the square of the amplitude, the secant at a_0 finds a^2/a_0 for a: the mean of this and a_0 is
         Newton's step. With the scatter that it has at the amplitude of a set, a stochastic one may not suffice though
-        it is all: it is tried at the amplitude that it has alone, too. Members of the best sets are always simulated,
-        and what is like them where a set suffices only because errors of templates are tolerated.
+        it is all: it is tried at the amplitude that it has alone, too, and so is what was simulated far from there in a
+        set of effects that are alike. Members of the best sets are always simulated, and what is like them where a set
+        suffices only because errors of templates are tolerated.
         """
         now = _Responses(t, t.copy(), list(candidates))
-        found = self._attribute(now.t, now.candidates)
+        first = found = self._attribute(now.t, now.candidates)
         for _ in range(self.context.settings.refine_rounds):
             tried = [self._simulate(now, *part, curved=True) for part in self._of_sets(now, sets)]
             changed = tried + [self._simulate(now, *part) for part in self._to_try(found, now.candidates)]
@@ -90,6 +91,11 @@ class Refiner:
                 break
             found = self._attribute(now.t, now.candidates)
         found = self._completed(now, found)
+        for index in self._displaced(now, first, found):
+            alone = self._alone(now, t, index)
+            own = self._completed(alone, self._attribute(alone.t, alone.candidates))
+            if (index,) in [one.members for one in own.explanations]:
+                now, found = alone, own
         scattered = [i for i, one in enumerate(now.candidates) if one.scatter is not None]
         for index in scattered if all(len(one.members) > 1 for one in found.explanations) else []:
             alone = self._alone(now, t, index)
@@ -190,10 +196,25 @@ class Refiner:
             now.candidates[index] = replace(candidate, acting=acting)
         return True
 
+    def _displaced(self, now: "_Responses", first: Attribution, found: Attribution) -> list[int]:
+        """Return candidates that explain less alone than by their linear responses, and were simulated elsewhere.
+
+        In a set the amplitudes of effects that are alike can be large and of opposite signs. A response that was
+        simulated there says nothing of the amplitude that the effect has alone, to which no other set may lead back.
+        """
+        return [
+            index
+            for index, done in now.done.items()
+            if now.candidates[index].scatter is None
+            and (alone := found.singles[index]).delta_chi2 < first.singles[index].delta_chi2
+            and not self._has_settled(done, alone.amplitudes, alone.covariance)
+        ]
+
     def _alone(self, now: "_Responses", linear: Matrix, index: int) -> "_Responses":
-        """Return the responses with a stochastic candidate at the amplitude that it has alone, from its linear one."""
+        """Return the responses with a candidate at the amplitude that it has alone, from its linear one."""
         null, columns = self.context.null, list(now.candidates[index].columns)
-        now = _Responses(linear, now.t.copy(), [*now.candidates])
+        done = {other: at for other, at in now.done.items() if other != index}
+        now = _Responses(linear, now.t.copy(), [*now.candidates], done)
         now.t[:, columns] = linear[:, columns]
         now.candidates[index] = replace(now.candidates[index], scatter=None)
         for _ in range(self.context.settings.refine_rounds):

@@ -260,3 +260,24 @@ def test_a_stochastic_effect_is_tried_at_the_amplitude_that_it_has_alone(monkeyp
     monkeypatch.setattr(instrument, "respond", respond)
     found = instrument.refined(x)
     assert [own.members for own in found.attribution.explanations] == ([(0,)] if enough < 10.0 else [(0, 1)])
+
+
+def test_what_was_simulated_far_away_in_a_set_is_tried_at_the_amplitude_that_it_has_alone(monkeypatch):
+    """In a set that looks best at first A is 60; alone it is 15, as it is, and then C suffices as well as A."""
+    instrument = Instrument(bend=0.04, cross=0.0)
+    x = instrument.response(15.0, 0.0)
+    instrument.t[:, 2] = x / np.linalg.norm(x)
+    far = instrument.null.fit(x + 45.0 * instrument.t[:, 0], instrument.t[:, :2])
+
+    def attributed(self, t, candidates):
+        found = attribute(instrument.null, x, t, candidates, instrument.calibration)
+        (best, *_) = found.explanations
+        in_a_set = replace(found, explanations=(replace(best, members=(0, 1), fit=far),), verdict="mixture")
+        return in_a_set if np.array_equal(t, instrument.t) else found
+
+    monkeypatch.setattr(Refiner, "_attribute", attributed)
+    found = instrument.refined(x).attribution
+    assert instrument.analysis[0]["A"] == pytest.approx(60.0, abs=1.0)
+    (own,) = [one for one in found.explanations if one.members == (0,)]
+    assert own.fit.amplitudes == pytest.approx([15.0], abs=0.3)
+    assert {one.members for one in found.explanations} == {(0,), (2,)}
