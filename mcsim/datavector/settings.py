@@ -136,9 +136,9 @@ class DiagnosisSettings:
         Share of the sky that a map lacks, as behind a mask, from which on maps are filtered by their inverse
         covariance, and not isotropically. 0: always, which costs a quarter more for each simulation.
     filter_tolerance, filter_iterations
-        At which the conjugate gradients of that filter end: what is left of the system, relative to what the filter
-        leaves of the sky, and number of iterations. Simulations and data go through the same ones, so that tests hold
-        for any: they cost power alone.
+        At which the conjugate gradients of that filter end for typical maps: what is left of the system, relative to
+        what the filter leaves of the sky, and number of iterations. Simulations and data go through the same ones, so
+        that tests hold for any: they cost power alone.
     sky_bins, beam_bins
         Bins in l of the spectrum of the sky, for each parity of l, which end where the bands of the effect ``spectrum``
         do; of each azimuthal order of a beam, from m = 0.

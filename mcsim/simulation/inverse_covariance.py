@@ -29,6 +29,7 @@ from mcsim.sphere.sky import gaussian_alm
 from mcsim.support.arrays import Alm, Cl, Map, Maps, Vector, divided
 
 ITERATIONS = 2000  #: after so many the conjugate gradients are given up
+TYPICAL = 3  #: maps that are drawn to tell how many iterations an approach takes
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +81,7 @@ class InverseCovariance:
             groups.setdefault(m.response.factors.tobytes(), []).append(i)
         self._members = list(groups.values())  # maps of equal responses
         self._root = np.sqrt(cl)
+        self._found: dict[float, int] = {}  # iterations of approach, by tolerance
 
     @property
     def size(self) -> int:
@@ -162,8 +164,7 @@ class InverseCovariance:
 
         ``near``: coefficients near the result, where the iterations begin; None: zero.
         """
-        scale = self._root
-        known = _packed(alm_.multiply(sky, scale, self.lmax), self.lmax)
+        scale, known = self._root, self._right_side(sky)
         if not known.any():
             return np.zeros_like(sky)
         begin = None
@@ -178,20 +179,42 @@ class InverseCovariance:
         return alm_.multiply(_unpacked(found, self.lmax), scale, self.lmax)
 
     def approach(self, sky: Alm, tolerance: float, iterations: int) -> Alm:
-        """Return the same as :meth:`solve` to a tolerance, or as near as so many iterations come.
+        """Return nearly the same as :meth:`solve`: of typical maps to a tolerance, or as near as these iterations come.
 
         What is left of the system is compared with S^-1/2 s^, which is what remains of the sky in C^-1 d: where the sky
         is far above the noise that is much less than the right hand side.
+
+        Notes
+        -----
+        All maps have the same number of iterations, that of most of :data:`TYPICAL` drawn ones. Iterations that end
+        when the tolerance is met make the result jump where a small change of the maps takes one more: in one sky of 20
+        the response to an effect of 1 %, per unit, was wrong by a hundred standard deviations of an element.
         """
-        known = _packed(alm_.multiply(sky, self._root, self.lmax), self.lmax)
-        modes, gain = 2.0 * np.arange(self.lmax + 1) + 1.0, self._gain
-        expected = float(np.sqrt(modes @ (gain / (1.0 + gain)) / (modes @ (gain * (1.0 + gain)))))
-        found, _ = conjugate_gradients(self._normal, known, self._precondition, (tolerance * expected, iterations))
+        known = self._right_side(sky)
+        enough = min(iterations, self._typical(tolerance))
+        found, _ = conjugate_gradients(self._normal, known, self._precondition, (0.0, enough))
         return alm_.multiply(_unpacked(found, self.lmax), self._root, self.lmax)
+
+    def _typical(self, tolerance: float) -> int:
+        """Return how many iterations of :meth:`approach` maps of this covariance take."""
+        if tolerance not in self._found:
+            modes, gain = 2.0 * np.arange(self.lmax + 1) + 1.0, self._gain
+            expected = float(np.sqrt(modes @ (gain / (1.0 + gain)) / (modes @ (gain * (1.0 + gain)))))
+            until = tolerance * expected, ITERATIONS
+            taken = []
+            for number in range(TYPICAL):
+                known = self._right_side(self.adjoint(self.precision * self.draw("typical", number)))
+                taken.append(conjugate_gradients(self._normal, known, self._precondition, until)[1])
+            self._found[tolerance] = sorted(taken)[TYPICAL // 2]
+        return self._found[tolerance]
+
+    def _right_side(self, sky: Alm) -> Vector:
+        """Return S^1/2 applied to coefficients, packed."""
+        return _packed(alm_.multiply(sky, self._root, self.lmax), self.lmax)
 
     def iterations(self, sky: Alm) -> int:
         """Return how many iterations :meth:`solve` takes."""
-        known = _packed(alm_.multiply(sky, self._root, self.lmax), self.lmax)
+        known = self._right_side(sky)
         return conjugate_gradients(self._normal, known, self._precondition, (self.tolerance, ITERATIONS))[1]
 
     def _normal(self, vector: Vector) -> Vector:

@@ -110,6 +110,15 @@ def test_filter_of_uniform_noise_is_the_isotropic_one() -> None:
     assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
 
 
+def test_an_approach_does_not_jump_between_maps(case) -> None:
+    """Some maps need one more iteration for the tolerance than others; on the way between them all have the same."""
+    filtered, _, _ = case
+    few, more = (filtered.adjoint(filtered.precision * filtered.draw("way", number)) for number in (0, 7))
+    found = np.stack([filtered.approach((1.0 - t) * few + t * more, 1.0, 30) for t in np.linspace(0.0, 1.0, 101)])
+    steps, bends = (np.linalg.norm(np.diff(found, n, axis=0), axis=1) for n in (1, 2))
+    assert bends.max() < 0.02 * steps.min()
+
+
 def test_bad_input_is_refused() -> None:
     beam = convolve.response(Beam.gaussian(900.0, LMAX), LMAX)
     with refused():
