@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.datavector.analysis import Analysis, Job, data_vectors
 from mcsim.datavector.bipolar_scan import rms
-from mcsim.datavector.candidate import Candidate, TemplateBank, numbered
+from mcsim.datavector.candidate import Candidate, TemplateBank, numbered, signal_share
 from mcsim.datavector.kept import Kept
 from mcsim.datavector.null_ensemble import NullEnsemble, without_nuisances
 from mcsim.datavector.repeats import check_alike, check_distinct, check_fresh
@@ -251,6 +251,7 @@ def learned(
         check_alike(null[:, :size], analysis.source, _COVARIANCE)
     labels = tuple(label for candidate in analysis.candidates for label in candidate.labels)
     matrix, curvature, error = np.zeros((3, whole, len(labels)))
+    measured: dict[int, Rows] = {}
     for candidate, column, sign, effect in _steps(analysis):
         other = results.get(Purpose("response", column, -sign))
         if sign < 0 and other is not None:
@@ -259,6 +260,7 @@ def learned(
         step = candidate.parametrization.coordinates(effect)[candidate.columns.index(column)]
         same = references[jobs[Purpose("response", column, sign)].source is not None][: len(here)]
         each, curvature[:, column] = responses(step, here, other, same)
+        measured[column] = each[:, :size]
         matrix[:, column] = each.mean(axis=0)
         error[:, column] = each.std(axis=0, ddof=1) / np.sqrt(len(each))
     offset = np.zeros(whole)
@@ -288,7 +290,12 @@ def learned(
         slice_reference=reference[:, size:],
         slice_elements=analysis.slices,
     )
-    return ensemble, TemplateBank(matrix[:size], error[:size], curvature[:size], labels, matrix[size:])
+    share = np.ones(len(labels))
+    bank = TemplateBank(matrix[:size], error[:size], curvature[:size], labels, share, matrix[size:])
+    faint = bank.faint(ensemble.spread, analysis.settings)
+    for column in np.flatnonzero(faint.any(axis=0)).tolist():
+        share[column] = signal_share(measured[column], faint[:, column], ensemble.gaussian.whitening)
+    return ensemble, bank
 
 
 def reduced(

@@ -205,8 +205,9 @@ def load(path: Path) -> tuple[NullEnsemble, TemplateBank]:
         columns = TypeAdapter(tuple[Column, ...]).validate_json(dataset.attrs["columns"])
         redundant, shrunk = float(dataset.attrs["redundant"]), bool(dataset.attrs["shrunk"])
         skies = int(dataset.attrs["skies"])
-    matrix, error, curvature, beside_matrix = map(arrays.pop, ("matrix", "error", "curvature", "slice_matrix"))
-    bank = TemplateBank(matrix, error, curvature, columns, beside_matrix)
+    names = "matrix", "error", "curvature", "faint_share", "slice_matrix"
+    matrix, error, curvature, share, beside_matrix = map(arrays.pop, names)
+    bank = TemplateBank(matrix, error, curvature, columns, share, beside_matrix)
     kept = NullEnsemble(
         **arrays, elements=elements, slice_elements=beside, redundant=redundant, shrunk=shrunk, skies=skies
     )

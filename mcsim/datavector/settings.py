@@ -117,7 +117,8 @@ class DiagnosisSettings:
     nonlinear_sigma
         Departure of a response from linear, in standard deviations, that is tolerated.
     noisy_share, clean_sigma
-        Templates with more than this share of noise in their squared norm keep elements above so many standard errors.
+        Of templates with more than this share of noise in their squared norm elements above so many standard errors are
+        kept, and of the others the share that is not noise.
     sky_scatter
         Relative scatter of a response above which it is simulated for the observed sky.
     stochastic_level

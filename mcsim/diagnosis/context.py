@@ -37,7 +37,7 @@ class DiagnosisContext:
     candidates: tuple[Candidate, ...]  # with the errors of their templates
     calibration: Calibration  # of the candidates
     sky_scatter: Vector  # relative scatter of each candidate's response among skies, (candidates,)
-    templates: Matrix  # (p, K), noisy ones without the elements that are only noise
+    templates: Matrix  # (p, K), of noisy ones faint elements are shrunk
     always: WhitenedTemplates  # those of candidates that are proposed whatever the data are, white, one by one
 
     @property

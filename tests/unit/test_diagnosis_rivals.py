@@ -70,11 +70,12 @@ def test_numbers_beside_the_data_vector_tell_a_rival_from_a_member(named, beside
 def test_columns_are_added_behind_those_of_a_bank():
     rng, labels = np.random.default_rng(6), candidate("a", None).labels
     matrix, more = rng.normal(size=(4, 1)), rng.normal(size=(6, 1))
-    bank = TemplateBank(matrix, 0.1 * matrix, 0.2 * matrix, labels, rng.normal(size=(2, 1)))
+    bank = TemplateBank(matrix, 0.1 * matrix, 0.2 * matrix, labels, np.array([0.3]), rng.normal(size=(2, 1)))
     wide = bank.with_columns(candidate("b", None).labels, more)
     np.testing.assert_array_equal(wide.matrix, np.hstack([matrix, more[:4]]))
     np.testing.assert_array_equal(wide.slice_matrix, np.hstack([bank.slice_matrix, more[4:]]))
     assert not np.any(wide.error[:, 1])
     assert not np.any(wide.curvature[:, 1])
+    assert wide.faint_share.tolist() == [0.3, 1.0]
     assert [one.effect for one in wide.labels] == ["a", "b"]
     assert not replace(bank, slice_matrix=np.zeros((0, 0))).with_columns(labels, more[:4]).slice_matrix.size

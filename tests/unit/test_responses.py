@@ -1,12 +1,14 @@
 """Responses to a step of an effect, from skies with the opposite step and without."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mcsim.datavector.campaign import responses
-from mcsim.datavector.candidate import TemplateBank
+from mcsim.datavector.candidate import TemplateBank, signal_share
+from mcsim.datavector.settings import DiagnosisSettings
 
 STEP, SKIES = 0.3, 6
 
@@ -38,7 +40,31 @@ def test_a_column_of_nothing_but_noise_says_nothing_of_the_scatter_among_skies()
     """However large it is in maps of little noise: of the others, 4 skies of 0.1 each are 0.2 about the mean."""
     clear, noise = np.full(3, 1e6), np.array([1e6, 1e5, 1e5])
     matrix, error = np.stack([clear, clear, noise], axis=1), np.stack([0.1 * clear, 0.1 * clear, 2.0 * noise], axis=1)
-    bank = TemplateBank(matrix, error, np.zeros((3, 3)), ())
+    bank = TemplateBank(matrix, error, np.zeros((3, 3)), (), np.ones(3))
     candidates = [SimpleNamespace(columns=columns) for columns in ((0,), (1, 2), (2,))]
     found = bank.sky_scatter(np.full(3, 1e-4), candidates, (4, 4, 4))
     np.testing.assert_allclose(found, [0.2 / np.sqrt(0.99)] * 2 + [np.inf])
+
+
+@pytest.mark.parametrize(("strength", "of_whole", "of_cut"), [(0.0, 0.2, 1.01), (3.0, 1.0, 0.1)])
+def test_a_noisy_template_keeps_of_its_faint_elements_what_is_no_noise(strength, of_whole, of_cut):
+    """Nearest to the truth in the metric of elements that are correlated, if their mean is ``strength`` of its error.
+
+    Squared distances are compared with those with all of the faint elements and with none.
+    """
+    rng, size, skies, settings = np.random.default_rng(8), 40, 12, replace(DiagnosisSettings(), noisy_share=0.0)
+    root = np.linalg.cholesky(0.9 ** np.abs(np.subtract.outer(np.arange(size), np.arange(size))))
+    whitening, spread = np.linalg.inv(root), np.ones(size)
+    truth = strength / np.sqrt(skies) * root @ rng.normal(size=size)
+    truth[:3] = 10.0
+    distances = []
+    for _ in range(200):
+        each = truth + rng.normal(size=(skies, size)) @ root.T
+        mean, error = each.mean(axis=0)[:, None], each.std(axis=0, ddof=1)[:, None] / np.sqrt(skies)
+        bank = TemplateBank(mean, error, np.zeros((size, 1)), (), np.ones(1))
+        shares = signal_share(each, bank.faint(spread, settings)[:, 0], whitening), 1.0, 0.0
+        found = [replace(bank, faint_share=np.array([one])).significant(spread, settings)[:, 0] for one in shares]
+        distances.append([np.sum((whitening @ (one - truth)) ** 2) for one in found])
+    shrunk, whole, cut = np.mean(distances, axis=0)
+    assert shrunk < of_whole * whole
+    assert shrunk < of_cut * cut
