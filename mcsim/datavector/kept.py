@@ -1,6 +1,7 @@
 """Results of simulations, kept until a model is learned: what is killed goes on where it stopped."""
 
 import hashlib
+import io
 import json
 import os
 import tempfile
@@ -8,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 
@@ -36,14 +38,15 @@ class Kept:
         return cls(folder, max(LEAST, most * NSIDE**2 // max(nside, NSIDE) ** 2))
 
     def found(self, job: Job) -> dict[int, Vector]:
-        """Return the rows of a job that are there, by realization."""
+        """Return the rows of a job that are there as they were written, by realization."""
         rows: dict[int, Vector] = {}
-        for path in self._stream(job).glob("*-*.npy"):
-            first, stop = map(int, path.stem.split("-"))
-            if first < job.first + job.count and stop > job.first:
-                # Another process has learned the model and removed it; or it was cut off as the computer stopped.
-                with suppress(OSError, EOFError, ValueError):
-                    rows.update(zip(range(first, stop), np.load(path), strict=True))
+        for path in self._stream(job).glob("*-*-*.npy"):
+            first, stop, check = path.stem.split("-")
+            if int(first) < job.first + job.count and int(stop) > job.first:
+                with suppress(OSError):  # another process has learned the model and removed it
+                    content = path.read_bytes()
+                    if crc32(content) == int(check, 16):
+                        rows.update(zip(range(int(first), int(stop)), np.load(io.BytesIO(content)), strict=True))
         return rows
 
     def missing(self, job: Job, found: Mapping[int, Vector]) -> Iterator[Job]:
@@ -57,7 +60,7 @@ class Kept:
             wanted = wanted[count:]
 
     def keep(self, piece: Job, rows: Matrix) -> None:
-        """Write the rows of a piece to a file that appears complete or not at all.
+        """Write the rows of a piece to a file that appears complete or not at all, with its CRC-32 in its name.
 
         It is not kept if another process, which has learned the model, removes the folder right then.
         """
@@ -65,8 +68,9 @@ class Kept:
         with folders.unwritable(folder, "make room there, or set MCSIM_CACHE to another folder"):
             folder.mkdir(parents=True, exist_ok=True)
             with suppress(FileNotFoundError), tempfile.TemporaryDirectory(dir=folder) as scratch:
-                write_npy(whole := Path(scratch) / f"{piece.first}-{piece.first + piece.count}.npy", rows)
-                os.replace(whole, folder / whole.name)
+                write_npy(whole := Path(scratch) / "rows.npy", rows)
+                check = crc32(whole.read_bytes())
+                os.replace(whole, folder / f"{piece.first}-{piece.first + piece.count}-{check:08x}.npy")
 
     def _stream(self, job: Job) -> Path:
         """Return the folder of all realizations of one kind."""
