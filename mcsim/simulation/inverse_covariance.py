@@ -81,7 +81,7 @@ class InverseCovariance:
             groups.setdefault(m.response.factors.tobytes(), []).append(i)
         self._members = list(groups.values())  # maps of equal responses
         self._root = np.sqrt(cl)
-        self._found: dict[float, int] = {}  # iterations of approach, by tolerance
+        self._found: dict[tuple[float, int], int] = {}  # iterations of approach, by tolerance and their largest number
 
     @property
     def size(self) -> int:
@@ -191,22 +191,22 @@ class InverseCovariance:
         the response to an effect of 1 %, per unit, was wrong by a hundred standard deviations of an element.
         """
         known = self._right_side(sky)
-        enough = min(iterations, self._typical(tolerance))
-        found, _ = conjugate_gradients(self._normal, known, self._precondition, (0.0, enough))
+        until = 0.0, self._typical(tolerance, iterations)
+        found, _ = conjugate_gradients(self._normal, known, self._precondition, until)
         return alm_.multiply(_unpacked(found, self.lmax), self._root, self.lmax)
 
-    def _typical(self, tolerance: float) -> int:
-        """Return how many iterations of :meth:`approach` maps of this covariance take."""
-        if tolerance not in self._found:
+    def _typical(self, tolerance: float, most: int) -> int:
+        """Return how many iterations to a tolerance maps of this covariance take, or ``most`` if they take more."""
+        if (tolerance, most) not in self._found:
             modes, gain = 2.0 * np.arange(self.lmax + 1) + 1.0, self._gain
             expected = float(np.sqrt(modes @ (gain / (1.0 + gain)) / (modes @ (gain * (1.0 + gain)))))
-            until = tolerance * expected, ITERATIONS
+            until = tolerance * expected, most
             taken = []
             for number in range(TYPICAL):
                 known = self._right_side(self.adjoint(self.precision * self.draw("typical", number)))
                 taken.append(conjugate_gradients(self._normal, known, self._precondition, until)[1])
-            self._found[tolerance] = sorted(taken)[TYPICAL // 2]
-        return self._found[tolerance]
+            self._found[tolerance, most] = min(most, sorted(taken)[TYPICAL // 2])
+        return self._found[tolerance, most]
 
     def _right_side(self, sky: Alm) -> Vector:
         """Return S^1/2 applied to coefficients, packed."""
