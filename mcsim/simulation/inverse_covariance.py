@@ -186,7 +186,7 @@ class InverseCovariance:
 
         Notes
         -----
-        All maps have the same number of iterations, that of most of :data:`TYPICAL` drawn ones. Iterations that end
+        All maps have the same number of iterations, the median of :data:`TYPICAL` drawn ones. Iterations that end
         when the tolerance is met make the result jump where a small change of the maps takes one more: in one sky of 20
         the response to an effect of 1 %, per unit, was wrong by a hundred standard deviations of an element.
         """
