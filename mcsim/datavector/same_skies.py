@@ -10,6 +10,7 @@ import healpy
 import numpy as np
 
 from mcsim import config, systematics
+from mcsim.datavector.added_maps import Added, AddedMaps
 from mcsim.datavector.analysis import Analysis, Job
 from mcsim.datavector.campaign import Ask, after_jobs, constrained_jobs
 from mcsim.datavector.wiener_filter import inverse_of, shared_sky
@@ -29,7 +30,7 @@ Factors = tuple[tuple[float, ...], ...]  #: by which channels see degrees otherw
 Orders = tuple[bytes, ...]
 """What beams have more in orders m > 0, by channel: complex b_lm, (m, lmax + 1), the first row zero; b"": little."""
 
-Seen = tuple[Factors, Orders]  #: how channels see a sky otherwise
+Seen = tuple[Factors, Orders, Added]  #: how channels see a sky otherwise, and what maps show besides
 
 Skies = Literal["reference", "typical", "constrained"]
 
@@ -64,9 +65,15 @@ class SameSkies:
         one, and a fit gives g/(1 + w g). So it is with each degree that a beam loses. Gains up to SMALL and beams up to
         BENT, the steps of linear responses among them, stay. What orders m > 0 of a beam add to a map is another map of
         the sky, which is in the filtered one with a weight, too: it is computed from the sky that is found, and taken
-        from the maps, until that sky changes no more.
+        from the maps, until that sky changes no more. What effects show without a sky, a foreground or a residual
+        dipole behind a mask, is simulated and taken from the maps first. Where a sky has a part of it already, the
+        effect adds more than it did to the data, and the fit too little.
         """
         return self._skies(self.seen(found))
+
+    @cached_property
+    def _added(self) -> AddedMaps:
+        return AddedMaps(self.analysis)
 
     @cached_property
     def _skies(self) -> Callable[[Seen], Alm]:
@@ -74,11 +81,12 @@ class SameSkies:
 
     def _sky(self, seen: Seen) -> Alm:
         """Return the filtered sky of the maps if channels see it otherwise."""
-        factors, orders = seen
-        found = before = self._through(factors, self.maps)
+        factors, orders, added = seen
+        maps = self._added.less(self.maps, added)
+        found = before = self._through(factors, maps)
         changed = np.inf
         for _ in range(ROUNDS if orders else 0):
-            last, before, found = changed, found, self._through(factors, self._without(orders, found))
+            last, before, found = changed, found, self._through(factors, self._without(orders, found, maps))
             changed = float(np.linalg.norm(found - before) / np.linalg.norm(before))
             if changed >= last:
                 return before
@@ -101,10 +109,10 @@ class SameSkies:
             model = replace(model, response=response, inverse=inverse)
         return shared_sky(model, given)
 
-    def _without(self, orders: Orders, sky: Alm) -> list[Map]:
-        """Return the maps without what other orders of the beams show of a sky."""
+    def _without(self, orders: Orders, sky: Alm, maps: Sequence[Map]) -> list[Map]:
+        """Return maps without what other orders of the beams show of a sky."""
         model, made = self.analysis.model, []
-        for part, map_ in zip(model.parts, self.maps, strict=True):
+        for part, map_ in zip(model.parts, maps, strict=True):
             more = np.frombuffer(orders[part.channel], dtype=np.complex128).reshape(-1, model.lmax + 1)
             if len(more):
                 channel = model.survey.channels[part.channel]
@@ -116,7 +124,7 @@ class SameSkies:
 
     def seen(self, found: Sequence[config.Effect]) -> Seen:
         """Return how the channels see a sky otherwise with effects."""
-        return self.factors(found), self.orders(found)
+        return self.factors(found), self.orders(found), self._added.run_of(found)
 
     def orders(self, found: Sequence[config.Effect]) -> Orders:
         """Return what effects add to the orders m > 0 of the beams; () if all is little."""
@@ -190,7 +198,7 @@ class SameSkies:
         """Return data vectors of the same skies without effects and with them, which the observed maps have too."""
         jobs = self._jobs(found, constrained, skies, there=found)
         source = jobs[0].source
-        before = self._before[constrained, source is not None, self.seen(found) if constrained else ((), ())]
+        before = self._before[constrained, source is not None, self.seen(found) if constrained else ((), (), "")]
         if (first := len(before)) < skies:
             same = [replace(job, source=source) for job in self._jobs((), constrained, skies, first, found)]
             before.extend(self._simulated(same)[first - skies :])

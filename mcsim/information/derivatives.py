@@ -139,10 +139,10 @@ def _derivative(analysis: Analysis, candidate: Candidate, basis: Effect, observe
     upper, lower = (at(sign) for sign in signs)
     width = step * (signs[0] - signs[1])
     noise = _noise_change(upper, lower, width)
-    plus, minus = _quiet(upper), _quiet(lower)
+    plus, minus = upper.without_noise, lower.without_noise
     if fit.stochastic and fit.sign < 0:
         # What is drawn is a Gaussian sky of its own with a power proportional to the amplitude.
-        own_survey = _quiet(survey(only, nthreads=nthreads, library=known))
+        own_survey = survey(only, nthreads=nthreads, library=known).without_noise
         factor = _power_factor(own_survey, replace(basis, amplitude=abs(basis.amplitude)), fit.coordinates(basis))
         return Derivative(maps, own_survey, None, 1.0, observe, factor, np.zeros_like(dipole), noise, True)
     changed = [name for name in _HOOKS if acts_through(kind, name)]
@@ -151,14 +151,6 @@ def _derivative(analysis: Analysis, candidate: Candidate, basis: Effect, observe
         return Derivative(maps, replace(plus, channels=channels), None, 1.0, None, None, dipole, noise, False)
     through = observe if changed == ["sky"] and not fit.stochastic else None
     return Derivative(maps, plus, minus, width, through, None, dipole, noise, fit.stochastic)
-
-
-def _quiet(shared: Survey) -> Survey:
-    """Return a survey without noise."""
-    channels = tuple(
-        replace(channel, maps=tuple(replace(m, noise_uk=None) for m in channel.maps)) for channel in shared.channels
-    )
-    return replace(shared, channels=channels)
 
 
 def _difference(plus: Channel, minus: Channel, width: float) -> Channel:

@@ -143,6 +143,13 @@ class Survey:
         return self if self.source is None else replace(self.source, config=self.config)
 
     @property
+    def without_noise(self) -> "Survey":
+        """The survey without noise that is added to maps; that of differencing scans is made with them."""
+        channels = (replace(c, maps=tuple(replace(m, noise_uk=None) for m in c.maps)) for c in self.channels)
+        source = None if self.source is None else self.source.without_noise
+        return replace(self, channels=tuple(channels), source=source)
+
+    @property
     def nside(self) -> int:
         """Resolution of the maps that are analysed, 0 on a grid without pixels."""
         return config.prepared_grid(self.config)[0]

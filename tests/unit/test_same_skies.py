@@ -32,7 +32,7 @@ def test_effects_are_asked_for_at_once_and_then_known(monkeypatch: pytest.Monkey
     asked: list[list[str]] = []
     monkeypatch.setattr(SameSkies, "_jobs", jobs)
     monkeypatch.setattr(SameSkies, "skies_of", lambda *_: "constrained")
-    monkeypatch.setattr(SameSkies, "seen", lambda *_: ((), ()))
+    monkeypatch.setattr(SameSkies, "seen", lambda *_: ((), (), ""))
     monkeypatch.setattr("mcsim.datavector.same_skies.replace", lambda job, **_: job)
     skies = SameSkies(None, ask, ())  # type: ignore[arg-type]
     effects = [config.Effect(name=name) for name in ("a", "bb")]
@@ -117,7 +117,34 @@ def test_the_sky_of_maps_with_an_ellipse_is_found_through_it() -> None:
         off, left = (np.linalg.norm(one - expected) for one in (circular, skies.observed_with(ellipse)))
         assert left < 0.3 * off
     slight = [config.Effect(name="beam_ellipticity", channel="W1", parameters={"amplitude": 0.02})]
-    assert skies.seen(slight) == ((), ())
+    assert skies.seen(slight) == ((), (), "")
+
+
+ADDED = [
+    ("dipole_residual", "W1", {"amplitude": 60.0, "lon_deg": 40.0, "lat_deg": 20.0}),
+    ("calibration", "V1", {"amplitude": 0.02}),  # of the dipole of 3.4 mK
+    ("monopole_residual", "V1", {"amplitude": 40.0}),
+]
+
+
+@pytest.mark.parametrize(("name", "channel", "parameters"), ADDED)
+def test_the_sky_of_maps_with_added_signals_is_found_without_them(
+    name: str, channel: str | None, parameters: Any
+) -> None:
+    """Behind a mask a dipole of 60 uK was taken for sky in part, so that half of it, added to that sky, fitted."""
+    table = two_channels("added", sigma0_uk=100.0)
+    table["map"]["mask"] = (np.array(healpy.pix2vec(16, np.arange(12 * 16**2))).T @ [0.6, 0.0, 0.8] < 0.4).astype(float)
+    run = config.load(table)
+    analysis = analysis_of(run, without=tuple(one for one in systematics.catalogue() if one != name))
+    expected = SameSkies(analysis, list, list(simulate.maps(survey(run), 0))).observed
+    effect = [config.Effect(name=name, channel=channel, parameters=parameters)]
+    skies = SameSkies(analysis, list, list(simulate.maps(survey(with_effects(run, effect)), 0)))
+    off, left = (np.linalg.norm(one - expected) for one in (skies.observed, skies.observed_with(effect)))
+    assert left < 0.01 * off
+    assert off > 0.2 * np.linalg.norm(expected)
+    step = analysis.candidates[0].basis[0].amplitude
+    small = [config.Effect(name=name, channel=channel, parameters={**parameters, "amplitude": step})]
+    assert skies.seen(small) == ((), (), "")
 
 
 def test_noise_alone_is_compared_in_as_many_skies_as_there_are_without_it() -> None:
