@@ -105,7 +105,8 @@ class Action:
     ``response`` is that at the fitted amplitude, shape (p + E,), and ``error`` the relative error of the amplitude;
     ``directions``, shape (p + E, K - 1), are the responses to changes of its parameters that leave the amplitude.
     ``scatter``, shape (p + E, draws), has the deviations of the draws of a stochastic effect; ``growth`` is the factor
-    of the variance of noise, and so of the standard deviation of its power.
+    of the variance of noise, and so of the standard deviation of its power, and ``wider`` that of the errors of
+    amplitudes with the effect in the data.
     """
 
     response: Vector
@@ -113,6 +114,7 @@ class Action:
     error: float
     scatter: Matrix | None = None
     growth: float = 1.0
+    wider: float = 1.0
 
     @classmethod
     def of(
@@ -251,16 +253,16 @@ class Slices:
         parts = [one @ response[rows] for one in division.keep]
         whole = null.fit(x, np.column_stack([beside, response[rows]]))
         apart = null.fit(x, np.column_stack([beside, *parts]))
-        amplitudes, errors = apart.amplitudes[count:], action.growth * apart.errors[count:]
+        amplitudes, errors = apart.amplitudes[count:], action.wider * apart.errors[count:]
         fitted, further = null.dimension - whole.dimension, whole.dimension - apart.dimension
         if further < 1 or np.any(errors == 0.0):
             return None
         allowance = self._tolerated(null, whole.amplitudes[-1] * response[rows])
-        more, chi2 = (max(one, 0.0) / action.growth**2 for one in (whole.chi2 - apart.chi2, whole.chi2))
+        more, chi2 = max(whole.chi2 - apart.chi2, 0.0) / action.wider**2, whole.chi2 / action.growth**2
         p = float(null.nested_test(more, chi2, further, fitted, Tolerated(allowance)))
         best = int(np.argmax(amplitudes / errors))
         found = null.fit(x, np.column_stack([beside, parts[best], sum(parts) - parts[best]]))
-        variance = (action.growth * found.errors[-1]) ** 2 + action.error**2 + self.settings.consistency_error**2
+        variance = (action.wider * found.errors[-1]) ** 2 + action.error**2 + self.settings.consistency_error**2
         odds = float(np.exp(min((0.5 - found.amplitudes[-1]) / variance, 100.0)))
         return Comparison(
             division.kind, division.words, tuple(map(float, amplitudes)), tuple(map(float, errors)), p, odds
@@ -312,7 +314,7 @@ class Slices:
         whole = self._amplitudes(np.arange(len(self.z) - self.beside), action) if seen else None
         for name, rows, null in seen:
             found = null.fit(self.z[rows], np.column_stack([response[rows], action.directions[rows]]))
-            amplitude, own = float(found.amplitudes[0]), float(found.errors[0])
+            amplitude, own = float(found.amplitudes[0]), action.wider * float(found.errors[0])
             each = self._amplitudes(rows, action)
             alike = 0.0 if whole is None or each is None else float(np.corrcoef(each, whole)[0, 1])
             apart = own**2 + action.error**2 - 2.0 * alike * own * action.error

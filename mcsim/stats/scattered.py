@@ -26,6 +26,7 @@ class Acting:
     #: what that is without it, and the squared standard error of this; shape (C,)
     excess: Vector
     error: Vector
+    own: float = 0.0  #: what it adds to the variance along its own response, over what that is without it
 
     @classmethod
     def of(cls, null: SimulatedGaussian, t: Matrix, groups: Groups, own: int, pair: tuple[Matrix, Matrix]) -> "Acting":
@@ -40,7 +41,8 @@ class Acting:
         before, after = (null.whiten_templates(rows.T).T for rows in pair)
         change = after - before
         basis, _ = orthonormal(null.whiten_templates(t[:, list(groups[own])]))
-        size = float(np.sum(change.mean(axis=0) ** 2))
+        mean = change.mean(axis=0)
+        size = float(mean @ mean)
         x, c = (np.sqrt(null.hartlap_factor) * (rows - rows.mean(axis=0)) for rows in (before, change))
         excess, error = np.zeros((2, len(groups)))
         for number, columns in enumerate(groups):
@@ -49,8 +51,10 @@ class Acting:
             if number == own or not beside.shape[1]:
                 continue
             excess[number], error[number] = _growth(x @ beside, c @ beside)
+        along = divided(basis.T @ mean, np.linalg.norm(basis.T @ mean))
+        growth, _ = _growth(x @ basis @ along[:, None], c @ basis @ along[:, None])
         added, spread = scatter_chi2(null, t[:, list(groups[own])], *pair)
-        return cls(size, added * size, spread * size**2, excess, error)
+        return cls(size, added * size, spread * size**2, excess, error, growth)
 
 
 def _growth(x: Matrix, c: Matrix) -> tuple[float, float]:

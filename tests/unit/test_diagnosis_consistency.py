@@ -103,11 +103,12 @@ class Bench:
         self.t = np.concatenate([shape, -shape, 2.0 * shape, -2.0 * shape])
         self.signs = np.repeat([1.0, -1.0, 1.0, -1.0], 4)
 
-    def findings(self, signal, theta, seed=None, candidate=GAIN, scatter=None):
+    def findings(self, signal, theta, seed=None, candidate=GAIN, scatter=None, wider=1.0):
         z = signal + (0.0 if seed is None else np.random.default_rng([4, seed]).normal(size=16))
         tested = Slices(self.ensemble, z, 8, ("half1", "half2"), 24, DiagnosisSettings())
-        covariance = np.linalg.inv(self.t.T @ self.t)
-        return tested.findings([candidate], [Action.of(self.t @ theta, self.t, theta, covariance, scatter)])
+        covariance = wider**2 * np.linalg.inv(self.t.T @ self.t)
+        action = replace(Action.of(self.t @ theta, self.t, theta, covariance, scatter), wider=wider)
+        return tested.findings([candidate], [action])
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +130,21 @@ def test_a_true_effect_is_refused_as_seldom_as_the_levels_say(bench):
     assert len(halves) == 300
     # The tolerated error of the response makes small p-values rarer.
     assert np.mean(np.array(halves) <= 0.05) <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 300)
+
+
+@pytest.mark.parametrize(("wider", "refused"), [(1.0, True), (2.0, False)])
+def test_parts_scatter_with_the_effect_as_the_amplitude_does(bench, wider, refused):
+    """The effect differs from half to half by sqrt(3) times the errors that the amplitudes have without it."""
+    draw, response = np.random.default_rng(13), bench.t @ THETA
+    first = np.tile(np.repeat([1.0, 0.0], 4), 2)
+    own = [half * response / np.linalg.norm(half * response) for half in (first, 1.0 - first)]
+    found = []
+    for seed in range(200):
+        more = sum(np.sqrt(3.0) * draw.normal() * one for one in own)
+        (each,) = bench.findings(response + more, THETA, seed, wider=wider).comparisons
+        found += [one.pvalue for one in each if one.kind == "halves"]
+    share = np.mean(np.array(found) <= 0.05)
+    assert (share > 0.05 + 6.0 * np.sqrt(0.05 * 0.95 / 200)) == refused
 
 
 def test_a_map_is_compared_as_the_part_of_the_fit_that_it_is(bench):
@@ -220,7 +236,7 @@ def test_more_noise_is_more_in_all_degrees_and_in_pixels():
 
     def refused(z, growth):
         tested = Slices(ensemble, z, 1, ("half1", "half2"), 24, DiagnosisSettings())
-        action = Action(white, np.zeros((5, 0)), 0.05, growth=growth)
+        action = Action(white, np.zeros((5, 0)), 0.05, growth=growth, wider=growth)
         (own,) = (found := tested.findings([candidate], [action])).comparisons
         (degrees,) = (one for one in own if one.kind == "degrees")
         assert degrees.slices == ("ℓ 0–12", "ℓ 13–24", "single pixels")

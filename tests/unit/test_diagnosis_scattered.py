@@ -128,6 +128,18 @@ def test_slopes_that_few_skies_do_not_tell_leave_the_errors_of_a_line() -> None:
     assert abs(np.median(shrunk) - 1.0) < 0.01
 
 
+def test_the_scatter_along_the_response_of_an_effect_is_that_of_its_amplitude() -> None:
+    """The response is t in the mean, and its size differs from sky to sky by twice the error of the amplitude."""
+    rng, t = np.random.default_rng(12), np.eye(P)[:, :2]
+    model = SimulatedGaussian(np.zeros(P), np.eye(P), 1_000_000)
+    before, size = rng.normal(size=(SKIES, P)), 30.0 + 2.0 * rng.normal(size=SKIES)
+    across = 5.0 * rng.normal(size=SKIES)
+    after = before + np.outer(size, t[:, 0]) + np.outer(across, t[:, 1])
+    found = Acting.of(model, np.eye(P)[:, :3], [(0, 1), (2,)], 0, (before, after))
+    assert found.own == pytest.approx(4.0, rel=5.0 * np.sqrt(2.0 / SKIES))
+    assert Acting.of(model, t, [(0, 1)], 0, (before, before + 30.0 * t[:, 0])).own == pytest.approx(0.0, abs=1e-12)
+
+
 def test_candidates_that_are_added_are_not_scattered_by_what_was_simulated_before() -> None:
     acting = Acting(100.0, 3.0, 0.1, np.array([0.0, 2.0]), np.array([0.0, 0.5]))
     beside = Beside.of([acting, None, None], None)
