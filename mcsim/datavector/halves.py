@@ -90,10 +90,8 @@ class Halves:
 
     def _scatter(self, before: Matrix, after: Matrix) -> tuple[float, float]:
         """Return the traces of the covariance that effects add to the part that judges, and of its square."""
-        one, other = before[:, self.second], after[:, self.second]
-        size = float(np.sum(self.fresh.whiten_templates(np.mean(other - one, axis=0)[:, None]) ** 2))
-        added, square = scatter_chi2(self.fresh, np.zeros((len(self.second), 0)), one, other)
-        return added * size, square * size**2
+        nothing = np.zeros((len(self.second), 0))
+        return scatter_chi2(self.fresh, nothing, before[:, self.second], after[:, self.second])
 
 
 def _squares(null: SimulatedGaussian, draws: Matrix) -> Vector:

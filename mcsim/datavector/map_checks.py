@@ -28,15 +28,14 @@ def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
     if broken:
         raise InputError(f"{name} has {broken} pixels that are not finite; mark what was not observed as UNSEEN.")
     map_ = np.where(map_ > UNSEEN_BELOW, map_, healpy.UNSEEN)  # of single precision it is another number
-    unseen = map_ == healpy.UNSEEN
     fiducial, limits = part.precision > 0, model.settings
-    lost = float(np.mean(unseen[fiducial]))
+    lost = share_left_out(part, map_)
     if lost > limits.missing_share:
         raise InputError(
             f"{name} leaves out {100 * lost:.3g} % of the pixels that the fiducial scan hits, at most "
             f"{100 * limits.missing_share:g} % may be; give the model a mask (map.mask) that leaves them out too."
         )
-    seen = map_[fiducial & ~unseen]
+    seen = map_[fiducial & (map_ != healpy.UNSEEN)]
     zeros = int(np.sum(seen == 0.0))
     if zeros > limits.missing_share * seen.size and not model.survey.config.preparation:
         raise InputError(
@@ -55,6 +54,23 @@ def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
             "its header (TUNIT1), or give it in uK."
         )
     return map_
+
+
+def share_left_out(part: Part, map_: Map) -> float:
+    """Return the share of the pixels of a map of the model that a map leaves out in its place."""
+    return float(np.mean(map_[part.precision > 0] == healpy.UNSEEN))
+
+
+def exchanges(parts: Sequence[Part]) -> list[tuple[int, ...]]:
+    """Return the orders of the maps in which two channels, or two splits of all channels, are exchanged."""
+    keys: list[tuple[int | str | None, ...]] = [(part.channel, part.split) for part in parts]
+    found = []
+    for axis in (0, 1):
+        for one, other in combinations(dict.fromkeys(key[axis] for key in keys), 2):
+            swap = {one: other, other: one}
+            moved = [tuple(swap.get(k, k) if i == axis else k for i, k in enumerate(key)) for key in keys]
+            found.append(tuple(keys.index(key) for key in moved))
+    return found
 
 
 def _check_size(run: config.RunConfig, map_: Map, name: str) -> None:

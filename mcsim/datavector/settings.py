@@ -126,7 +126,8 @@ class DiagnosisSettings:
     settled_sigma, settled_share
         Amplitudes have converged if they move by less than so many standard errors, or by this share.
     tried
-        Single candidates that are simulated at their amplitude if no single effect is accepted.
+        Single candidates that are simulated at their amplitude if no single effect is accepted; up to twice as many if
+        they explain nearly as much as the best.
     beam_orders, split_beam_orders
         Highest azimuthal order m of a beam that is measured; the same for every map of a channel by itself.
     noise_floor

@@ -12,6 +12,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.slices import northern
 from mcsim.datavector.summaries import Element, bins, scales
 from mcsim.sphere.rotation import FRAMES
+from mcsim.stats.excess import scatter_chi2
 from mcsim.stats.gaussian import SimulatedGaussian, Tolerated
 from mcsim.support.arrays import Matrix, Rows, Vector
 from mcsim.support.numbers import number, p_equals
@@ -106,7 +107,8 @@ class Action:
     ``directions``, shape (p + E, K - 1), are the responses to changes of its parameters that leave the amplitude.
     ``scatter``, shape (p + E, draws), has the deviations of the draws of a stochastic effect; ``growth`` is the factor
     of the variance of noise, and so of the standard deviation of its power, and ``wider`` that of the errors of
-    amplitudes with the effect in the data.
+    amplitudes with the effect in the data. ``pair`` are data of the same skies without the effect and with it, (skies,
+    p + E) each.
     """
 
     response: Vector
@@ -115,6 +117,7 @@ class Action:
     scatter: Matrix | None = None
     growth: float = 1.0
     wider: float = 1.0
+    pair: tuple[Matrix, Matrix] | None = None
 
     @classmethod
     def of(
@@ -187,8 +190,7 @@ class Slices:
         channels = {candidate.channel for candidate in candidates}
         names = {element.channels[0] for element in self.ensemble.elements[len(self.z) - self.beside :]}
         seen = sorted(names if None in channels else {one for one in channels if one is not None})
-        responses = np.column_stack([action.response for action in actions])
-        checks = (self._left(channel, responses, free) for channel in ([] if noisy else seen))
+        checks = (self._left(channel, actions, free) for channel in ([] if noisy else seen))
         return Findings(tuple(comparisons), tuple(check for check in checks if check is not None))
 
     def _own(self, channel: str | None) -> list[tuple[int, Element]]:
@@ -330,19 +332,22 @@ class Slices:
         t = null.whiten_templates(np.column_stack([action.response[rows], action.directions[rows]]))
         return np.asarray(self.ensemble.simulations[:, rows] @ (np.linalg.pinv(t)[0] @ null.whitening))
 
-    def _left(self, channel: str, responses: Matrix, directions: Matrix) -> MapCheck | None:
-        """Return chi^2 of a channel's largest scales before and after effects are taken out; None if not known."""
+    def _left(self, channel: str, actions: Sequence[Action], directions: Matrix) -> MapCheck | None:
+        """Return chi^2 of a channel's largest scales before and after effects, and their scatter; None if not known."""
         maps = self._maps(channel)
         rows = np.array([row for members in maps.values() for row in members], dtype=np.int64)
         null = self.null(rows)
         if null is None:
             return None
-        x = self.z[rows]
+        x, responses = self.z[rows], np.column_stack([action.response for action in actions])
         t, count = np.column_stack([responses[rows], directions[rows]]), responses.shape[1]
         forecast = null.expected_snr(t[:, :count].sum(axis=1)) ** 2
         found = null.fit(x, t)
         tolerated = self._tolerated(null, *(t * found.amplitudes)[:, :count].T)
-        p = float(null.residual_test(found.chi2, null.dimension - found.dimension, tolerated))
+        pairs = [action.pair for action in actions if action.pair is not None]
+        each = [scatter_chi2(null, t, before[:, rows], after[:, rows]) for before, after in pairs]
+        added, spread = (sum(one) for one in zip((tolerated, 0.0), *each, strict=True))
+        p = float(null.residual_test(found.chi2, null.dimension - found.dimension, added, spread))
         scale = null.hartlap_factor
         return MapCheck(tuple(maps), scale * null.chi2(x), scale * found.chi2, forecast, found.dimension, p)
 

@@ -124,7 +124,15 @@ class DataSet(ABC, Generic[Data]):
 
     def respond(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return changes of the data vector by effects, (rows, p), in ``skies`` skies or those of the reference."""
-        return np.concatenate(self.ask(after_jobs(self.context.analysis, found))) - self.context.reference(found)
+        before, after = self.pair_extended(found, skies)
+        return after - before
+
+    def pair_extended(self, found: Sequence[config.Effect], skies: int) -> tuple[Matrix, Matrix]:
+        """Return :attr:`extended` of skies without and with effects that are simulated in the same ones, (rows, p + E).
+
+        They are ``skies`` skies, or those of the reference.
+        """
+        return self.context.reference(found), np.concatenate(self.ask(after_jobs(self.context.analysis, found)))
 
     @property
     def extended(self) -> Vector:

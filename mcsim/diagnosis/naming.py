@@ -13,6 +13,7 @@ from mcsim.diagnosis.drawn import is_drawn
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.errors import InputError
+from mcsim.support.arrays import Matrix
 
 
 def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[Attribution, list[str]]:
@@ -103,9 +104,11 @@ def _actions(data: DataSet[Any], refined: Refined, one: Explanation) -> Iterator
         t = whole[:, list(candidate.columns)]
         draws, scatter = refined.candidates[member].scatter is not None or candidate.parametrization.nonlinear, None
         skies, growth = context.settings.scatter_skies if draws else context.settings.constrained_skies, 1.0
+        pair: tuple[Matrix, Matrix] | None = None
         try:
             effect = candidate.detected(theta, covariance)
-            changes = data.respond_extended([candidate.table(effect)], skies)
+            pair = data.pair_extended([candidate.table(effect)], skies)
+            changes = pair[1] - pair[0]
             own = (effect.noise(one.site) for one in sites if candidate.channel in (None, one.site.channel))
             growth = max([1.0, *(float(np.mean(one)) for one in own if one is not None)])
             response, scatter = changes.mean(axis=0), data.scatter(changes) if draws else None
@@ -114,4 +117,4 @@ def _actions(data: DataSet[Any], refined: Refined, one: Explanation) -> Iterator
         acting = refined.candidates[member].acting
         variance = 1.0 if acting is None else 1.0 + max(acting.own, 0.0)
         action = Action.of(response, t, theta, variance * covariance, scatter)
-        yield replace(action, growth=growth, wider=max(growth, float(np.sqrt(variance))))
+        yield replace(action, growth=growth, wider=max(growth, float(np.sqrt(variance))), pair=pair)

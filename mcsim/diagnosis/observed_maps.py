@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 
 import healpy
 import numpy as np
@@ -12,9 +11,9 @@ import numpy as np
 from mcsim import config
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.localisation import Place, places, standardised
+from mcsim.datavector.map_checks import exchanges, share_left_out
 from mcsim.datavector.nuisances import half_given_other
 from mcsim.datavector.same_skies import SameSkies, Skies
-from mcsim.datavector.wiener_filter import Part
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.selection import Attribution
 from mcsim.errors import InputError
@@ -58,18 +57,20 @@ class ObservedMaps(DataSet[Sequence[Map]]):
 
     def respond_extended(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return the changes of :meth:`respond` with those of the numbers beside the data vector, (rows, p + E)."""
-        kinds: dict[Skies, list[config.Effect]] = {"reference": [], "typical": [], "constrained": []}
+        kinds: dict[Skies, list[config.Effect]] = {}
         for effect in found:
-            kinds[self.same_skies.skies_of(effect)].append(effect)
-        shift = np.zeros((1, len(self.extended)))
-        if own := kinds["reference"]:
-            changes = self.same_skies.of_reference(own) - self.context.extended_reference(own)
-            shift = changes.mean(axis=0) if len(own) < len(found) else changes
-        for kind in ("typical", "constrained"):
-            if own := kinds[kind]:
-                before, after = self.same_skies.pair(own, skies, kind == "constrained")
-                shift = shift + after - before
-        return shift
+            kinds.setdefault(self.same_skies.skies_of(effect), []).append(effect)
+        pairs = {kind: self.pair_extended(own, skies) for kind, own in kinds.items()}
+        changes = {kind: after - before for kind, (before, after) in pairs.items()}
+        if len(changes) > 1 and "reference" in changes:
+            changes["reference"] = changes["reference"].mean(axis=0, keepdims=True)
+        return np.asarray(sum(changes.values()))
+
+    def pair_extended(self, found: Sequence[config.Effect], skies: int) -> tuple[Matrix, Matrix]:
+        """Return data without and with effects of one kind of skies, those of the first, shape (skies, p + E) each."""
+        if (kind := self.same_skies.skies_of(found[0])) == "reference":
+            return self.context.extended_reference(found), self.same_skies.of_reference(found)
+        return self.same_skies.pair(found, skies, kind == "constrained")
 
     def responses(self, candidates: Sequence[Candidate], skies: int) -> Iterator[tuple[Candidate, Matrix]]:
         """Yield candidates with their responses, all of which are simulated at once if all can be."""
@@ -120,6 +121,9 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         parts, notes = context.analysis.model.parts, []
 
         def pvalue(maps: Sequence[Map]) -> float:
+            # What is left out is filled, and departs from no model.
+            if max(map(share_left_out, parts, maps)) > context.settings.missing_share:
+                return 0.0
             return context.null.pvalue(context.analysis.data_vector(maps))
 
         if (p := pvalue([healpy.reorder(one, n2r=True) for one in self.data])) > level:
@@ -161,15 +165,3 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         ensemble = self.context.ensemble
         drawn = len(ensemble.bipolar_scan)
         return standardised(self._measured[2], ensemble.residual_mean, ensemble.residual_scatter, drawn)
-
-
-def exchanges(parts: Sequence[Part]) -> list[tuple[int, ...]]:
-    """Return the orders of the maps in which two channels, or two splits of all channels, are exchanged."""
-    keys: list[tuple[int | str | None, ...]] = [(part.channel, part.split) for part in parts]
-    found = []
-    for axis in (0, 1):
-        for one, other in combinations(dict.fromkeys(key[axis] for key in keys), 2):
-            swap = {one: other, other: one}
-            moved = [tuple(swap.get(k, k) if i == axis else k for i, k in enumerate(key)) for key in keys]
-            found.append(tuple(keys.index(key) for key in moved))
-    return found

@@ -16,6 +16,7 @@ from mcsim.stats.scattered import Acting, with_drawn_scatter
 from mcsim.support.arrays import Matrix, Vector
 
 ALIKE = 0.7  #: cosine of linear responses from which on one candidate can pass for another
+NEARLY = 0.8  #: share of what the best single candidate explains, from which on others are tried that explain less
 
 
 @dataclass(frozen=True)
@@ -352,7 +353,9 @@ class Refiner:
         # mixture seems to be sufficient. Where a single one is, the stochastic ones that may be as well.
         alone = bool(found.explanations) and len(found.explanations[0].members) == 1
         tried = 0 if alone else self.context.settings.tried
-        ranked = [int(index) for index in np.argsort([-single.delta_chi2 for single in found.singles])]
+        explained = np.array([single.delta_chi2 for single in found.singles])
+        tried = min(max(tried, int(np.sum(explained >= NEARLY * explained.max()))), 2 * tried)
+        ranked = [int(index) for index in np.argsort(-explained)]
         stochastic = {candidates[index].identity for index in work if candidates[index].parametrization.stochastic}
         for place, index in enumerate(ranked):
             single, candidate = found.singles[index], candidates[index]

@@ -88,9 +88,8 @@ def excess_of(chi2: float, p: int, n: int) -> Measured:
 def scatter_chi2(null: SimulatedGaussian, t: Matrix, before: Matrix, after: Matrix) -> tuple[float, float]:
     """Return what effects add to chi^2 of a residual by their scatter, and to half of its variance beyond twice that.
 
-    They are divided by the squared white response, and by its square. ``before`` and ``after`` are data vectors of the
-    same skies without the effects and with them, shape (skies, p_raw), ``t`` the templates that are fitted, shape
-    (p_raw, K).
+    ``before`` and ``after`` are data vectors of the same skies without the effects and with them, shape (skies, p_raw),
+    ``t`` the templates that are fitted, shape (p_raw, K).
 
     Notes
     -----
@@ -102,9 +101,6 @@ def scatter_chi2(null: SimulatedGaussian, t: Matrix, before: Matrix, after: Matr
     to it. Tests: tests/statistical/test_elliptical.py.
     """
     change = after - before
-    size = float(np.sum(null.whiten_templates(change.mean(axis=0)[:, None]) ** 2))
-    if size == 0.0:
-        return 0.0, 0.0
     basis, _ = orthonormal(null.whiten_templates(t))
     contrasts = np.sqrt(null.hartlap_factor) * helmert(len(change))
     white = (contrasts @ null.whiten_templates(rows.T).T for rows in (after, before, change))
@@ -117,7 +113,7 @@ def scatter_chi2(null: SimulatedGaussian, t: Matrix, before: Matrix, after: Matr
     square = (float(np.sum(product)) - float(np.trace(product))) / max(pairs, 1.0)
     square = max(square, added**2 / max(null.dimension - basis.shape[1], 1))
     square += 0.5 * float(np.sum((each - np.mean(each)) ** 2)) / max(pairs, 1.0)
-    return added / size, square / size**2
+    return added, square
 
 
 def expected_fall(test: SimulatedGaussian, t: Matrix, amplitudes: Vector, covariance: Matrix) -> Measured:

@@ -53,8 +53,7 @@ class Acting:
             excess[number], error[number] = _growth(x @ beside, c @ beside)
         along = divided(basis.T @ mean, np.linalg.norm(basis.T @ mean))
         growth, _ = _growth(x @ basis @ along[:, None], c @ basis @ along[:, None])
-        added, spread = scatter_chi2(null, t[:, list(groups[own])], *pair)
-        return cls(size, added * size, spread * size**2, excess, error, growth)
+        return cls(size, *scatter_chi2(null, t[:, list(groups[own])], *pair), excess, error, growth)
 
 
 def _growth(x: Matrix, c: Matrix) -> tuple[float, float]:

@@ -408,6 +408,9 @@ def test_maps_of_another_order_are_noticed(small):
     assert "NESTED" in notes([healpy.reorder(one, r2n=True) for one in maps])
     assert "V1:half1 as V1:half2" in notes([maps[i] for i in (1, 0, 3, 2)])
     assert "NESTED" not in notes(maps)
+    # What is left out is filled, and departs from no model.
+    seen = [np.where(np.arange(one.size) % 20 == k, healpy.UNSEEN, one) for k, one in enumerate(maps)]
+    assert notes([seen[i] for i in (1, 0, 3, 2)]) == ""
 
 
 def test_a_beam_that_no_effect_changes_has_no_single_name(small):

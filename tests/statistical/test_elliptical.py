@@ -86,8 +86,7 @@ def test_scatter_that_effects_add(growth: float) -> None:
     for _ in range(400):
         before = rng.normal(size=(skies, p))
         after = noisy * before + 10.0 * t[:, 0] + spread * rng.normal(size=(skies, p))
-        size = np.sum((after - before).mean(axis=0) ** 2)
-        forecasts.append(np.array(scatter_chi2(null, t, before, after)) * [size, size**2])
+        forecasts.append(np.array(scatter_chi2(null, t, before, after)))
     added = (noisy**2 - 1.0 + spread**2 + ((noisy - 1.0) ** 2 + spread**2) / skies)[1:]
     q, (trace, square) = p - 1, np.mean(forecasts, axis=0)
     errors = 4.0 * np.std(forecasts, axis=0) / np.sqrt(len(forecasts))

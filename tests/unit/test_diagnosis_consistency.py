@@ -103,11 +103,11 @@ class Bench:
         self.t = np.concatenate([shape, -shape, 2.0 * shape, -2.0 * shape])
         self.signs = np.repeat([1.0, -1.0, 1.0, -1.0], 4)
 
-    def findings(self, signal, theta, seed=None, candidate=GAIN, scatter=None, wider=1.0):
+    def findings(self, signal, theta, seed=None, candidate=GAIN, scatter=None, wider=1.0, pair=None):
         z = signal + (0.0 if seed is None else np.random.default_rng([4, seed]).normal(size=16))
         tested = Slices(self.ensemble, z, 8, ("half1", "half2"), 24, DiagnosisSettings())
         covariance = wider**2 * np.linalg.inv(self.t.T @ self.t)
-        action = replace(Action.of(self.t @ theta, self.t, theta, covariance, scatter), wider=wider)
+        action = replace(Action.of(self.t @ theta, self.t, theta, covariance, scatter), wider=wider, pair=pair)
         return tested.findings([candidate], [action])
 
 
@@ -145,6 +145,19 @@ def test_parts_scatter_with_the_effect_as_the_amplitude_does(bench, wider, refus
         found += [one.pvalue for one in each if one.kind == "halves"]
     share = np.mean(np.array(found) <= 0.05)
     assert (share > 0.05 + 6.0 * np.sqrt(0.05 * 0.95 / 200)) == refused
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_maps_may_keep_what_the_effect_leaves_by_its_scatter(bench, known):
+    """In each sky the response differs from its mean by as much as noise, which eight skies tell."""
+    draw, response, left = np.random.default_rng(14), bench.t @ THETA, []
+    for seed in range(200):
+        before = draw.normal(size=(8, 16))
+        pair = (before, before + response + draw.normal(size=(8, 16))) if known else None
+        found = bench.findings(response + draw.normal(size=16), THETA, seed, pair=pair)
+        left += [one.pvalue for one in found.maps]
+    share, error = np.mean(np.array(left) <= 0.05), np.sqrt(0.05 * 0.95 / 200)
+    assert (share < 0.05 + 4.0 * error) if known else (share > 0.05 + 6.0 * error)
 
 
 def test_a_map_is_compared_as_the_part_of_the_fit_that_it_is(bench):

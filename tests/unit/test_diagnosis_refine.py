@@ -55,6 +55,7 @@ class Instrument:
         self.calibration = calibrate(self.null, self.null.whiten_groups(self.t, [(0,), (1,), (2,)]))
         self.curvature = np.outer(bend * self.sideways[0], [1.0, 0.0, 0.0])
         self.analysis: list[dict[str | None, float]] = []
+        self.settings = DiagnosisSettings()
 
     def response(self, a: float, b: float) -> np.ndarray:
         return self.t[:, :2] @ [a, b] + self.bend * a**2 * self.sideways[0] + self.cross * a * b * self.sideways[1]
@@ -76,7 +77,7 @@ class Instrument:
 
     def refined(self, x: np.ndarray, sets=()):
         bank = SimpleNamespace(curvature=self.curvature)
-        context = SimpleNamespace(null=self.null, calibration=self.calibration, bank=bank, settings=DiagnosisSettings())
+        context = SimpleNamespace(null=self.null, calibration=self.calibration, bank=bank, settings=self.settings)
         own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter, "rescaled": lambda tables: False}
         gap = global_test(self.null, x, self.null.whiten_groups(self.t, [(0,), (1,), (2,)]), self.calibration)
         data = SimpleNamespace(context=context, x=x, realizations=1, gap=gap, **own)
@@ -92,6 +93,18 @@ def test_a_bent_response_is_found_at_its_amplitude(amplitude):
     found = instrument.refined(x).attribution
     assert [explanation.members for explanation in found.explanations] == [(0,)]
     assert found.explanations[0].fit.amplitudes == pytest.approx([amplitude], abs=0.3)
+
+
+@pytest.mark.parametrize(("along", "first"), [(15.9, [["C"], ["A"]]), (21.0, [["C"], ["C"]])])
+def test_what_explains_nearly_as_much_as_the_best_is_tried_too(along, first):
+    """A is bent: its line explains 225 of 549, and C, which leaves something else, 253 or 441."""
+    instrument = Instrument(bend=0.08, cross=0.0)
+    instrument.settings = DiagnosisSettings(tried=1)
+    x = instrument.response(15.0, 0.0)
+    size = float(np.linalg.norm(x))
+    instrument.t[:, 2] = along * x / size**2 + np.sqrt(1.0 - (along / size) ** 2) * instrument.sideways[1]
+    instrument.refined(x)
+    assert [list(tables) for tables in instrument.analysis[:2]] == first
 
 
 def test_a_rival_is_simulated_at_its_amplitude_though_another_is_named():
