@@ -114,7 +114,9 @@ def _actions(data: DataSet[Any], refined: Refined, one: Explanation) -> Iterator
             response, scatter = changes.mean(axis=0), data.scatter(changes) if draws else None
         except InputError:
             response = t @ theta
-        acting = refined.candidates[member].acting
+        if draws:  # its scatter is in the covariance
+            pair = None
+        acting = None if draws else refined.candidates[member].acting
         variance = 1.0 if acting is None else 1.0 + max(acting.own, 0.0)
         action = Action.of(response, t, theta, variance * covariance, scatter)
         yield replace(action, growth=growth, wider=max(growth, float(np.sqrt(variance))), pair=pair)
