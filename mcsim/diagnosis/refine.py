@@ -134,20 +134,35 @@ class Refiner:
     def _alike(self, now: "_Responses", one: Explanation) -> list[tuple[tuple[int, ...], int]]:
         """Return candidates that were not simulated and are like a member of a set, behind the other members.
 
-        None if the residual passes without an error of the templates. Far from linear responses what is tolerated is
-        much, and what is there looks worse than what is like it until it is simulated.
+        All of them if the residual does not pass without an error of the templates: far from linear responses what is
+        tolerated is much, and what is there looks worse than what is like it until it is simulated. Otherwise those
+        whose response bends so much there that it may be all that they fit worse by.
         """
-        if one.fit.pvalue > self.context.settings.residual_level:
-            return []
+        tolerated = one.fit.pvalue <= self.context.settings.residual_level
         cosine = cosines(self.context.null.whiten_groups(now.linear, [own.columns for own in now.candidates]))
         found: dict[int, tuple[int, ...]] = {}
         for member in one.members:
             others = tuple(other for other in one.members if other != member)
             taken = {now.candidates[other].identity for other in others}
             for index in np.flatnonzero(cosine[member] >= ALIKE).tolist():
-                if index not in now.done and now.candidates[index].identity not in taken:
+                if index in now.done or now.candidates[index].identity in taken:
+                    continue
+                if tolerated or self._may_replace(now, one, others, index):
                     found.setdefault(index, others)
         return [(others, index) for index, others in found.items()]
+
+    def _may_replace(self, now: "_Responses", one: Explanation, others: tuple[int, ...], index: int) -> bool:
+        """Return True if an effect fits worse than a set beside others by no more than its bent response may cost it.
+
+        A template that is wrong by b standard deviations raises chi^2 of the true effect by b^2 on average, with a
+        scatter of 2 b.
+        """
+        together = (*others, index)
+        fit = self.context.null.fit(self.data.x, now.t[:, columns_of(now.candidates, together)])
+        *_, (_, coordinates, _) = parts_of(now.candidates, together, fit)
+        bend = self._bend(list(now.candidates[index].columns), coordinates)
+        allowed = (bend + 2.0) ** 2 + 2.0 * np.log(self.context.settings.odds_cut)
+        return bend > self.context.settings.nonlinear_sigma and fit.chi2 - one.fit.chi2 <= allowed
 
     def _simulate_in_place(self, now: "_Responses", others: tuple[int, ...], index: int) -> bool:
         """Simulate a candidate beside others at its amplitude until that settles; return True if anything changed."""
@@ -385,10 +400,13 @@ class Refiner:
 
     def _is_nonlinear(self, columns: list[int], coordinates: Vector) -> bool:
         """Return True if the second derivative matters at these coordinates."""
+        return self._bend(columns, coordinates) > self.context.settings.nonlinear_sigma
+
+    def _bend(self, columns: list[int], coordinates: Vector) -> float:
+        """Return by how many standard deviations a response departs from a straight line at these coordinates."""
         shift = self.context.bank.curvature[:, columns] @ coordinates**2
         crossed = float(np.sum(np.abs(coordinates)) ** 2) / max(float(coordinates @ coordinates), 1e-300)
-        size = float(np.linalg.norm(self.context.null.whiten_templates(shift[:, None])))
-        return crossed * size > self.context.settings.nonlinear_sigma
+        return crossed * float(np.linalg.norm(self.context.null.whiten_templates(shift[:, None])))
 
     def _has_settled(self, before: Vector | None, now: Vector, covariance: Matrix, share: float = 0.0) -> bool:
         """Return True if amplitudes have hardly moved, by their errors, or by a share of their size."""

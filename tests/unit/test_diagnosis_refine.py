@@ -118,6 +118,17 @@ def test_a_rival_is_simulated_at_its_amplitude_though_another_is_named():
     assert {one.members for one in found.explanations} == {(0,), (2,)}
 
 
+@pytest.mark.parametrize(("beside", "members"), [(0.0, {(0,), (2,)}), (13.0, {(2,)})])
+def test_what_is_like_a_name_is_simulated_where_its_response_bends(beside, members):
+    """C has the response of A at its amplitude. Beside it A leaves 9^2, which its bend of 9 can be, or 9^2 + 13^2."""
+    instrument = Instrument(bend=0.04, cross=0.0)
+    x = instrument.response(15.0, 0.0) + beside * instrument.t[:, 1]
+    instrument.t[:, 2] = x / np.linalg.norm(x)
+    found = instrument.refined(x).attribution
+    assert {one.members for one in found.explanations} == members
+    assert any("A" in tables for tables in instrument.analysis) == ((0,) in members)
+
+
 def test_what_is_like_a_member_is_simulated_where_a_set_suffices_by_tolerance_alone():
     """C has the response of A at its amplitude but for 0.9 %: 1 % is tolerated, which is ten standard deviations."""
     instrument = Instrument(bend=0.0005, cross=0.0)
