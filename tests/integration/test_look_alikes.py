@@ -42,10 +42,10 @@ def test_a_ring_in_one_channel_is_not_called_the_opposite_ring_in_the_other_alon
 
 
 def test_a_set_that_no_other_agrees_beside_is_left_out(known):
-    """At the level of 0.01 the ring that is there is accepted too, and both are a set."""
-    model = replace(known.analysis.model, settings=replace(known.settings, residual_level=0.02))
+    """Of all data the twin leaves p = 0.30, and the ring that is there, which parts contradict, 0.33."""
+    model = replace(known.analysis.model, settings=replace(known.settings, residual_level=0.31))
     known = replace(known, analysis=replace(known.analysis, model=model))
-    data = data_of(known.run, "beam_sidelobe", "W1", seed=1020, amplitude=0.0018, calibrated="dipole")
+    data = data_of(known.run, "beam_sidelobe", "W1", seed=1029, amplitude=0.0018, calibrated="dipole")
     found = diagnose_data(ObservedMaps(known, list(simulate.maps(data, 0)), ask), "alone")
     assert found.kind == "unknown"
     assert [one.effects[0].name for one in found.contradicted] == ["beam_sidelobe"]
