@@ -16,8 +16,10 @@ from mcsim.datavector.campaign import Ask, after_jobs, constrained_jobs
 from mcsim.datavector.wiener_filter import inverse_of, shared_sky
 from mcsim.instrument.beams import Beam
 from mcsim.simulation import convolve
+from mcsim.simulation.channels import table_of
 from mcsim.simulation.survey import Channel
 from mcsim.support.arrays import Alm, Map, Matrix, Vector, divided
+from mcsim.systematics.added import DipoleResidual
 
 SMALL = 2e-3  #: gain of a channel that observed skies may have in them: responses are wrong by less than this share
 
@@ -179,6 +181,20 @@ class SameSkies:
         """Return True for what a beam, or a pixel, does to the power of the sky of the only channel."""
         kind, alone = dict(self.analysis.library)[effect.name], len(self.analysis.model.channels) == 1
         return alone and systematics.acts_through(kind, "beam", "spread")
+
+    def dipole_left(self, found: Sequence[config.Effect]) -> list[config.Effect]:
+        """Return the residual dipole that beams with effects leave in the only channel; [] if they leave none.
+
+        What a simulator of another program sees of a dipole is not known.
+        """
+        channels, known = self.analysis.model.survey.channels, DipoleResidual.name in dict(self.analysis.library)
+        if len(channels) > 1 or not known or self.analysis.source is not None:
+            return []
+        before, after = (beam.blm[0, 1].real for beam in self._beams(channels[0], found))
+        left = (after / before - 1.0) * channels[0].site.dipole_uk
+        if not left.any():
+            return []
+        return [table_of(DipoleResidual(**DipoleResidual.parametrization.nearest(left, np.eye(3))), channels[0].name)]
 
     def ahead(self, each: Sequence[config.Effect], skies: int) -> None:
         """Simulate single effects at once that :meth:`of_reference` or :meth:`pair` will be asked for one by one.

@@ -69,8 +69,21 @@ class ObservedMaps(DataSet[Sequence[Map]]):
     def pair_extended(self, found: Sequence[config.Effect], skies: int) -> tuple[Matrix, Matrix]:
         """Return data without and with effects of one kind of skies, those of the first, shape (skies, p + E) each."""
         if (kind := self.same_skies.skies_of(found[0])) == "reference":
-            return self.context.extended_reference(found), self.same_skies.of_reference(found)
+            return self.of_reference(found)
         return self.same_skies.pair(found, skies, kind == "constrained")
+
+    def of_reference(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix]:
+        """Return data of the skies of reference without effects and with them, shape (skies, p + E) each.
+
+        The dipole that effects leave in the only channel does there what it does in skies that the maps constrain: this
+        is known of the observed sky, if behind a mask by chance much of it looks like a dipole, other than its power.
+        """
+        before, after = self.context.extended_reference(found), self.same_skies.of_reference(found)
+        if left := self.same_skies.dipole_left(found):
+            apart, together = self.same_skies.pair(left, self.context.settings.constrained_skies, constrained=True)
+            typical = self.same_skies.of_reference(left) - before
+            after = after - typical + np.resize(together - apart, typical.shape)
+        return before, after
 
     def responses(self, candidates: Sequence[Candidate], skies: int) -> Iterator[tuple[Candidate, Matrix]]:
         """Yield candidates with their responses, all of which are simulated at once if all can be."""
@@ -81,12 +94,13 @@ class ObservedMaps(DataSet[Sequence[Map]]):
     def pair(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix]:
         """Return data vectors of the same skies without effects and with them; for noise alone of typical skies."""
         size, skies, library = len(self.x), self.context.settings.constrained_skies, dict(self.context.analysis.library)
-        alone = all(library[effect.name].parametrization.noise_alone for effect in found)
-        if alone or any(self.same_skies.skies_of(effect) == "reference" for effect in found):
-            before = self.context.reference(found)
-            after = self.same_skies.of_reference(found, min(skies, len(before)) if alone else None)[:, :size]
-            return before[: len(after)], after
-        before, after = self.same_skies.pair(found, skies, True)
+        if all(library[effect.name].parametrization.noise_alone for effect in found):
+            before = self.context.reference(found)[:skies]
+            after = self.same_skies.of_reference(found, len(before))
+        elif any(self.same_skies.skies_of(effect) == "reference" for effect in found):
+            before, after = self.of_reference(found)
+        else:
+            before, after = self.same_skies.pair(found, skies, True)
         return before[:, :size], after[:, :size]
 
     def in_same_skies(self, found: Sequence[config.Effect]) -> list[list[config.Effect]]:

@@ -147,6 +147,22 @@ def test_the_sky_of_maps_with_added_signals_is_found_without_them(
     assert skies.seen(small) == ((), (), "")
 
 
+def test_the_dipole_that_a_gain_leaves_in_the_only_channel_is_a_residual_one() -> None:
+    """A calibration that is 2 % too high leaves 2 % of the dipole of 3364.5 uK, and among two channels nothing."""
+    table = two_channels("left")
+    gain = [config.Effect(name="calibration", channel="V1", parameters={"amplitude": 0.02})]
+    others = [name for name in systematics.catalogue() if name != "calibration"]
+    assert SameSkies(analysis_of(config.load(table), without=others), list, ()).dipole_left(gain) == []
+    table["channel"] = table["channel"][:1]
+    skies = SameSkies(analysis_of(config.load(table), without=others), list, ())
+    (left,) = skies.dipole_left(gain)
+    found = systematics.build(systematics.catalogue()[left.name], dict(left.parameters))
+    dipole = skies.analysis.model.survey.channels[0].site.dipole_uk
+    assert (left.name, left.channel) == ("dipole_residual", "V1")
+    np.testing.assert_allclose(found.vector, 0.02 * dipole, rtol=1e-9)  # type: ignore[attr-defined]
+    assert skies.dipole_left([config.Effect(name="noise_level", channel="V1", parameters={"amplitude": 0.1})]) == []
+
+
 def test_noise_alone_is_compared_in_as_many_skies_as_there_are_without_it() -> None:
     """More skies may be constrained by data than there are of responses that are random."""
     settings = DiagnosisSettings.quick(constrained_skies=16)
