@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from mcsim.bipolar import by_degree
 from mcsim.datavector import pixel_noise
+from mcsim.datavector.parts import Part, keeps_pixels, marginalised, regressions
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
-from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
 from mcsim.simulation.noise import NoiseOfFiles
@@ -50,44 +50,6 @@ EXACT = 0.1  #: filter_tolerance of the exact filter
 TAIL = 1e-3  #: part of the squared S/N of a change of a beam that is left beyond the last degree of its order
 EARLIEST = 16  #: degree at which orders may end: bins have degrees
 SAVED = 0.1  #: least part of a transform that an earlier last degree must save
-
-LEFT = 0.01  #: share of what was subtracted from maps that stays in :meth:`Part.without_response`
-RANK = 1e-10  #: smallest eigenvalue over the largest of templates that are fitted and subtracted
-
-
-@dataclass(frozen=True)
-class Part:
-    """Describe one map of the data: its place in the survey, and its weights."""
-
-    channel: int
-    name: str  # in the survey
-    split: str | None  # None if there are none
-    moments: Moments  # of the orientations of its samples
-    precision: Map  # inverse variance of the noise of every pixel, uK^-2, (npix,); 0 where unobserved or masked
-    noise_power: float  # of the noise in the map's a_lm when its pixels count alike, uK^2 sr
-    #: what its preparation fits and subtracts, shape (K, npix), and with which weights, if that counts
-    subtracted: tuple[tuple[NDArray[np.float64], Map], ...] = ()
-
-    def without_subtracted(self, map_uk: Map) -> Map:
-        """Return a map from which all is subtracted once more: observed ones may have some of it, simulated none."""
-        for columns, used, normal in self._weighted:
-            map_uk = map_uk - np.linalg.lstsq(normal, used @ map_uk, rcond=RANK)[0] @ columns
-        return map_uk
-
-    def without_response(self, residual: Map) -> Map:
-        """Return a residual whose products with signals are those with what the preparation leaves of these, uK^-1.
-
-        But for a share LEFT: scores of what is subtracted are small, and not mere rounding.
-        """
-        for columns, used, normal in reversed(self._weighted):
-            residual = residual - (1.0 - LEFT) * np.linalg.lstsq(normal, columns @ residual, rcond=RANK)[0] @ used
-        return residual
-
-    @property
-    def _weighted(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Return columns, columns with weights, and their normal matrix."""
-        used = [np.where(self.moments.hits > 0, weight, 0.0) * columns for columns, weight in self.subtracted]
-        return [(columns, own, own @ columns.T) for (columns, _), own in zip(self.subtracted, used, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -161,8 +123,10 @@ class Model:
             return self
         if not self.white:
             return self._of_mean()
-        inverse = inverse_of(self.cl, self.response, self.parts, offsets=True)
-        return replace(self, inverse=inverse, settings=replace(self.settings, filter_tolerance=EXACT))
+        parts = marginalised(self.survey, self.parts)
+        inverse = inverse_of(self.cl, self.response, parts, offsets=True)
+        settings = replace(self.settings, filter_tolerance=EXACT)
+        return replace(self, parts=parts, inverse=inverse, settings=settings)
 
     @property
     def has_exact(self) -> bool:
@@ -181,17 +145,12 @@ class Model:
             for rows in (self.response, self.unresolved)
         )
         own, alike = [_variance(one - shared) for one in self.unresolved], _variance(shared)
-        parts, known = list[Part](), list[tuple[NDArray[np.float64], Map]]()
-        for part, m in zip(self.parts, (m for channel in self.survey.channels for m in channel.maps), strict=True):
-            subtracted = []
-            for one in () if m.preparation is None else m.preparation.regressions():  # kept once
-                same = (other for other in known if all(map(np.array_equal, one, other)))
-                subtracted.append(next(same, one))
-                known.append(subtracted[-1])
-            precision = part.precision / (1.0 + own[part.channel] * part.precision)
-            parts.append(replace(part, precision=precision, subtracted=tuple(subtracted)))
+        parts = [
+            replace(part, precision=part.precision / (1.0 + own[part.channel] * part.precision), subtracted=tuple(one))
+            for part, one in zip(self.parts, regressions(self.survey), strict=True)
+        ]
         total = np.sum([part.precision for part in parts], axis=0)
-        mean = replace(parts[0], channel=0, precision=total / (1.0 + alike * total))
+        mean = replace(parts[0], channel=0, precision=total / (1.0 + alike * total), subtracted=())
         settings = replace(self.settings, filter_tolerance=EXACT)
         inverse = inverse_of(self.cl, response[None], [mean])
         return replace(self, parts=tuple(parts), inverse=inverse, settings=settings, pooled=alike)
@@ -252,13 +211,16 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     snr = survey.cl * sum(response[part.channel] ** 2 / part.noise_power for part in parts)
     lmax = _highest_degree(survey, snr)
     hidden = max(float(np.mean(part.precision == 0.0)) for part in parts)
-    known = not survey.config.preparation and bool(np.all(snr[lmax + 1 :] <= 1.0) and snr[lmax] <= SHARP)
+    known = keeps_pixels(survey) and bool(np.all(snr[lmax + 1 :] <= 1.0) and snr[lmax] <= SHARP)
     white = all(_has_white_noise(m) for channel in survey.channels for m in channel.maps)
     beyond = (np.arange(snr.size) > lmax) * (white and np.any(snr[lmax + 1 :] > 1.0))
     unresolved = beyond * np.sqrt(survey.cl) * response
     cl, response, snr = survey.cl[: lmax + 1], response[:, : lmax + 1], snr[: lmax + 1]
     dipole = dipole_alm(survey.channels[0].site.dipole_uk, lmax)
-    inverse = inverse_of(cl, response, parts) if known and hidden >= settings.hidden_share else None
+    inverse = None
+    if known and hidden >= settings.hidden_share:
+        parts = list(marginalised(survey, parts))
+        inverse = inverse_of(cl, response, parts)
     maps = survey.nside, cl, response, tuple(parts), dipole
     return Model(survey, lmax, *maps, inverse, known and white, unresolved, snr / (1.0 + snr), settings)
 
@@ -272,8 +234,11 @@ def inverse_of(cl: Cl, response: Matrix, parts: Sequence[Part], offsets: bool = 
 
     They are those at the centres of pixels, or, with ``offsets``, at the means of their samples.
     """
-    through = [convolve.Response(row[None].astype(np.complex128)) for row in response]
-    observed = [ObservedMap(through[p.channel], p.precision, p.moments if offsets else None) for p in parts]
+    through, observed = [convolve.Response(row[None].astype(np.complex128)) for row in response], []
+    for p in parts:
+        columns = [own for own, _ in p.subtracted]
+        templates = columns[0] if len(columns) == 1 else np.concatenate(columns) if columns else None
+        observed.append(ObservedMap(through[p.channel], p.precision, p.moments if offsets else None, templates))
     return InverseCovariance(cl, observed)
 
 
@@ -288,7 +253,7 @@ def _highest_degree(survey: Survey, snr: Cl) -> int:
     prepared maps, whose noise is not white and whose pixels may be degraded.
     """
     last = min(snr.size - 1, 5 * survey.nside // 2)
-    if survey.config.preparation or np.any(snr[last + 1 :] > 1.0):
+    if not keeps_pixels(survey) or np.any(snr[last + 1 :] > 1.0):
         return survey.lmax
     return max(survey.lmax, int(np.flatnonzero(snr[: last + 1] >= FAINT).max(initial=0)))
 
@@ -415,7 +380,7 @@ def _sky(model: Model, clean: Sequence[Map], careful: bool = False) -> Alm:
     lmax, settings = model.lmax, model.settings
     if model.inverse is not None:
         maps = divided(*_summed(model, clean))[None] if model.pooled else np.stack(clean)
-        weighted = model.inverse.adjoint(model.inverse.precision * maps)
+        weighted = model.inverse.adjoint(model.inverse.weighted(maps))
         tolerance = settings.filter_tolerance * (0.01 if careful else 1.0)
         return model.inverse.approach(weighted, tolerance, settings.filter_iterations)
     total = np.zeros(alm_.size(lmax), dtype=np.complex128)

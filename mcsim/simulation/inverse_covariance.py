@@ -9,6 +9,9 @@ The system has the size (lmax + 1)^2 of the sky, however many maps there are. It
 a sky without power at some l is no exception, by conjugate gradients (Wandelt, Larson & Lakshminarayanan 2004,
 Phys. Rev. D 70, 083511; Eriksen et al. 2004, ApJS 155, 227), preconditioned in pixels
 (:mod:`mcsim.simulation.preconditioner`).
+
+Of maps from which templates T were fitted and subtracted N^-1 - N^-1 T (T^t N^-1 T)^-1 T^t N^-1 stands for N^-1: with
+any amplitude of T it is the same, whatever weights the fit had.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -26,8 +29,9 @@ from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, rng
 from mcsim.sphere.checks import check_cl
 from mcsim.sphere.sky import gaussian_alm
-from mcsim.support.arrays import Alm, Cl, Map, Maps, Vector, divided
+from mcsim.support.arrays import Alm, Cl, Map, Maps, Matrix, Vector, divided
 
+RANK = 1e-10  #: smallest eigenvalue over the largest of templates that are fitted and subtracted
 ITERATIONS = 2000  #: after so many the conjugate gradients are given up
 TYPICAL = 3  #: maps that are drawn to tell how many iterations an approach takes
 
@@ -41,6 +45,21 @@ class ObservedMap:
     precision: Map
     #: orientation moments and centroids of the samples; None: only the circular part of the beam, at pixel centres
     moments: Moments | None = None
+    #: what was fitted and subtracted, of any amplitude, shape (K, npix)
+    templates: NDArray[np.float64] | None = None
+
+    @cached_property
+    def _normal(self) -> Matrix:
+        """Return the pseudo-inverse of the normal matrix of the templates, shape (K, K)."""
+        assert self.templates is not None  # the caller has asked
+        return np.asarray(np.linalg.pinv(self.precision * self.templates @ self.templates.T, RANK, hermitian=True))
+
+    def weighted(self, map_uk: Map) -> Map:
+        """Return N^-1 applied to a map, without what the templates explain of it, uK^-1."""
+        found = self.precision * map_uk
+        if self.templates is not None:
+            found -= self.precision * (self._normal @ (self.templates @ found) @ self.templates)
+        return found
 
     @property
     def spins(self) -> list[int]:
@@ -155,9 +174,13 @@ class InverseCovariance:
         seen = self.precision > 0.0
         return np.where(seen, self.observe(sky) + divided(1.0, np.sqrt(self.precision)) * noise, 0.0)
 
+    def weighted(self, maps: Maps, part: slice = slice(None)) -> Maps:
+        """Return N^-1 applied to all maps, or to those of ``part``, uK^-1; what was subtracted has no weight."""
+        return np.stack([one.weighted(map_) for one, map_ in zip(self.maps[part], maps, strict=True)])
+
     def of_own(self, maps: Maps, part: slice) -> Alm:
         """Return P^t N^-1 applied to some maps, the others being zero; ``part`` says which they are."""
-        return self.adjoint(self.precision[part] * maps, range(len(self.maps))[part])
+        return self.adjoint(self.weighted(maps, part), range(len(self.maps))[part])
 
     def solve(self, sky: Alm, near: Alm | None = None) -> Alm:
         """Return (S^-1 + P^t N^-1 P)^-1 applied to coefficients; InputError if the iterations do not converge.
@@ -203,7 +226,7 @@ class InverseCovariance:
             until = tolerance * expected, most
             taken = []
             for number in range(TYPICAL):
-                known = self._right_side(self.adjoint(self.precision * self.draw("typical", number)))
+                known = self._right_side(self.adjoint(self.weighted(self.draw("typical", number))))
                 taken.append(conjugate_gradients(self._normal, known, self._precondition, until)[1])
             self._found[tolerance, most] = min(most, sorted(taken)[TYPICAL // 2])
         return self._found[tolerance, most]
@@ -220,16 +243,16 @@ class InverseCovariance:
     def _normal(self, vector: Vector) -> Vector:
         """Return (1 + S^1/2 P^t N^-1 P S^1/2) applied to packed coefficients."""
         s = alm_.multiply(_unpacked(vector, self.lmax), self._root, self.lmax)
-        back = self.adjoint(self.precision * self.observe(s))
+        back = self.adjoint(self.weighted(self.observe(s)))
         return vector + _packed(alm_.multiply(back, self._root, self.lmax), self.lmax)
 
     def wiener(self, maps: Maps) -> Alm:
         """Return s^ = S P^t C^-1 d, the sky as far as maps tell it, uK."""
-        return self.solve(self.adjoint(self.precision * maps))
+        return self.solve(self.adjoint(self.weighted(maps)))
 
     def apply(self, maps: Maps, sky: Alm | None = None) -> Maps:
         """Return C^-1 d, uK^-1; ``sky`` is s^, if it is known already."""
-        return self.precision * (maps - self.observe(self.wiener(maps) if sky is None else sky))
+        return self.weighted(maps - self.observe(self.wiener(maps) if sky is None else sky))
 
     def _moved(self, members: Sequence[int]) -> dict[int, Moments]:
         """Return the moments of those maps that have centroids."""

@@ -41,6 +41,14 @@ class Preparation:
         """Return the number of scalar transforms of one map."""
         return sum(step.transforms for step in self.steps)
 
+    @property
+    def subtracts(self) -> bool:
+        """Return True if all steps fit and subtract templates, or mask whole pixels: the rest of the map stays."""
+        return all(
+            one.coefficients is None if isinstance(one, Regression) else isinstance(one, Weighted) and one.whole
+            for one in self.steps
+        )
+
     def apply(self, map_uk: Map) -> Map:
         """Return the prepared map, uK, ``healpy.UNSEEN`` where nothing was observed, before as after."""
         check_map(map_uk)

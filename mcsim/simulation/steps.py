@@ -189,6 +189,11 @@ class Weighted(Step):
 
     mask: Map
 
+    @property
+    def whole(self) -> bool:
+        """Return True if pixels are kept as they are, or not at all."""
+        return bool(np.isin(self.mask, (0.0, 1.0)).all())
+
     def apply(self, map_uk: Map) -> Map:
         """Return the product: 0 where the mask is, observed or not."""
         return np.where(self.mask == 0.0, 0.0, self.mask * map_uk)

@@ -97,6 +97,26 @@ def test_inverse_equals_a_dense_solve(case) -> None:
     np.testing.assert_allclose(sky, power * (response.T @ expected), rtol=0, atol=1e-6 * np.abs(sky).max())
 
 
+def test_what_was_subtracted_has_no_weight(case) -> None:
+    """It equals noise of 10 mK in each template, and maps that differ by templates are the same."""
+    filtered, matrix, seen = case
+    templates = np.stack([np.ones(12 * NSIDE**2), *healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))])
+    own = [replace(one, templates=templates) if i != 1 else one for i, one in enumerate(filtered.maps)]
+    without = InverseCovariance(CL, own, tolerance=1e-12)
+    power = np.repeat(CL[alm_.degrees(LMAX)], np.where(alm_.orders(LMAX) == 0, 1, 2))
+    covariance = (matrix * power) @ matrix.T + np.diag(1.0 / np.where(seen, filtered.precision.ravel(), 1.0))
+    for i in (0, 2):
+        own_pixels = slice(i * templates.shape[1], (i + 1) * templates.shape[1])
+        covariance[own_pixels, own_pixels] += 1e8 * templates.T @ templates
+    data = np.random.default_rng(5).normal(size=filtered.precision.shape) * 60.0
+    expected = np.linalg.solve(covariance[np.ix_(seen, seen)], data.ravel()[seen])
+    found = without.apply(data)
+    np.testing.assert_allclose(found.ravel()[seen], expected, rtol=0, atol=1e-4 * np.abs(expected).max())
+    moved = data + np.array([[100.0], [0.0], [30.0]]) * templates[1]
+    np.testing.assert_allclose(without.apply(moved), found, rtol=0, atol=1e-6 * np.abs(found).max())
+    assert np.abs(found - filtered.apply(data)).max() > 0.01 * np.abs(found).max()
+
+
 def test_filter_of_uniform_noise_is_the_isotropic_one() -> None:
     """s^ = C_l B_l / (C_l B_l^2 + N_l) a_lm where the pixels' own quadrature is as good as that of a weight."""
     beam = convolve.response(Beam.gaussian(900.0, LMAX), LMAX)

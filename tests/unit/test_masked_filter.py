@@ -9,8 +9,9 @@ import pytest
 from instruments import two_channels
 from mcsim import config
 from mcsim.config.noise import NoiseCorrelated
+from mcsim.datavector.parts import LEFT
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import LEFT, model_of, shared_sky, wiener_filter
+from mcsim.datavector.wiener_filter import model_of, shared_sky, wiener_filter
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
@@ -78,6 +79,19 @@ def test_the_score_of_a_signal_has_the_variance_of_its_response(run):
     exact, isotropic = excesses(model, HEIGHT, model, replace(model, inverse=None))
     assert abs(exact - 1.0) < 4.0 * np.sqrt(2.0 / 99)
     assert isotropic > 1.2 * exact
+
+
+def test_masked_maps_without_their_dipole_are_filtered_as_if_it_were_not_known(run):
+    """The scores of a signal have the variance of its response; of the fit's weights they do not depend."""
+    table = config.to_dict(run) | {"preparation": [{"kind": "subtract_dipole", "mask": run.map.mask}]}
+    model = modelled(config.load(table), filter_tolerance=0.01)
+    pattern = np.where(np.abs(HEIGHT) > CUT, 5.0 * HEIGHT**3 - 3.0 * HEIGHT, 0.0)
+    exact, isotropic = excesses(model, pattern, model, replace(model, inverse=None))
+    assert abs(exact - 1.0) < 4.0 * np.sqrt(2.0 / 99)
+    assert isotropic > 1.2 * exact
+    maps = list(simulate.maps(model.survey, 0))
+    moved = [map_ + 40.0 * HEIGHT + 7.0 for map_ in maps]
+    np.testing.assert_allclose(shared_sky(model, moved), shared_sky(model, maps), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("hidden", [False, True])
