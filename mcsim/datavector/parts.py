@@ -2,16 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.instrument.scan import Moments
+from mcsim.simulation.inverse_covariance import covariance_of_amplitudes
 from mcsim.simulation.survey import Survey
-from mcsim.support.arrays import Map
+from mcsim.support.arrays import Map, Matrix
 
 LEFT = 0.01  #: share of what was subtracted from maps that stays in :meth:`Part.without_response`
-RANK = 1e-10  #: smallest eigenvalue over the largest of templates that are fitted and subtracted
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,8 @@ class Part:
 
     def without_subtracted(self, map_uk: Map) -> Map:
         """Return a map from which all is subtracted once more: observed ones may have some of it, simulated none."""
-        for columns, used, normal in self._weighted:
-            map_uk = map_uk - np.linalg.lstsq(normal, used @ map_uk, rcond=RANK)[0] @ columns
+        for columns, weight, covariance in self._fits:
+            map_uk = map_uk - covariance @ (columns @ (weight * map_uk)) @ columns
         return map_uk
 
     def without_response(self, residual: Map) -> Map:
@@ -38,15 +39,15 @@ class Part:
 
         But for a share LEFT: scores of what is subtracted are small, and not mere rounding.
         """
-        for columns, used, normal in reversed(self._weighted):
-            residual = residual - (1.0 - LEFT) * np.linalg.lstsq(normal, columns @ residual, rcond=RANK)[0] @ used
+        for columns, weight, covariance in reversed(self._fits):
+            residual = residual - (1.0 - LEFT) * weight * (covariance @ (columns @ residual) @ columns)
         return residual
 
-    @property
-    def _weighted(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Return columns, columns with weights, and their normal matrix."""
-        used = [np.where(self.moments.hits > 0, weight, 0.0) * columns for columns, weight in self.subtracted]
-        return [(columns, own, own @ columns.T) for (columns, _), own in zip(self.subtracted, used, strict=True)]
+    @cached_property
+    def _fits(self) -> list[tuple[NDArray[np.float64], Map, Matrix]]:
+        """Return columns, weights where the map was observed, and the covariance of amplitudes."""
+        each = [(columns, np.where(self.moments.hits > 0, weight, 0.0)) for columns, weight in self.subtracted]
+        return [(columns, weight, covariance_of_amplitudes(columns, weight)) for columns, weight in each]
 
 
 def keeps_pixels(survey: Survey) -> bool:
@@ -73,7 +74,9 @@ def marginalised(survey: Survey, parts: Sequence[Part]) -> tuple[Part, ...]:
 
     With the noise as weights the residual then has none of it, whatever the weights of the preparation were.
     """
-    return tuple(
-        replace(part, subtracted=tuple((columns, part.precision) for columns, _ in own))
-        for part, own in zip(parts, regressions(survey), strict=True)
-    )
+    found = []
+    for part, own in zip(parts, regressions(survey), strict=True):
+        columns = [one for one, _ in own]
+        together = columns if len(columns) < 2 else [np.concatenate(columns)]
+        found.append(replace(part, subtracted=tuple((one, part.precision) for one in together)))
+    return tuple(found)

@@ -232,13 +232,14 @@ def _has_white_noise(m: SurveyMap) -> bool:
 def inverse_of(cl: Cl, response: Matrix, parts: Sequence[Part], offsets: bool = False) -> InverseCovariance:
     """Return the inverse covariance of all maps, of the circular parts of their beams.
 
-    They are those at the centres of pixels, or, with ``offsets``, at the means of their samples.
+    They are those at the centres of pixels, or, with ``offsets``, at the means of their samples. Of what is subtracted
+    parts are :func:`marginalised`, or know nothing.
     """
     through, observed = [convolve.Response(row[None].astype(np.complex128)) for row in response], []
-    for p in parts:
-        columns = [own for own, _ in p.subtracted]
-        templates = columns[0] if len(columns) == 1 else np.concatenate(columns) if columns else None
-        observed.append(ObservedMap(through[p.channel], p.precision, p.moments if offsets else None, templates))
+    for part in parts:
+        templates = part.subtracted[0][0] if part.subtracted else None
+        moments = part.moments if offsets else None
+        observed.append(ObservedMap(through[part.channel], part.precision, moments, templates))
     return InverseCovariance(cl, observed)
 
 

@@ -31,7 +31,7 @@ from mcsim.sphere.checks import check_cl
 from mcsim.sphere.sky import gaussian_alm
 from mcsim.support.arrays import Alm, Cl, Map, Maps, Matrix, Vector, divided
 
-RANK = 1e-10  #: smallest eigenvalue over the largest of templates that are fitted and subtracted
+RANK = 1e-10  #: smallest eigenvalue over the largest of normalised templates that are fitted and subtracted
 ITERATIONS = 2000  #: after so many the conjugate gradients are given up
 TYPICAL = 3  #: maps that are drawn to tell how many iterations an approach takes
 
@@ -48,24 +48,22 @@ class ObservedMap:
     #: what was fitted and subtracted, of any amplitude, shape (K, npix)
     templates: NDArray[np.float64] | None = None
 
-    @cached_property
-    def _normal(self) -> Matrix:
-        """Return the pseudo-inverse of the normal matrix of the templates, shape (K, K)."""
-        assert self.templates is not None  # the caller has asked
-        return np.asarray(np.linalg.pinv(self.precision * self.templates @ self.templates.T, RANK, hermitian=True))
-
-    def weighted(self, map_uk: Map) -> Map:
-        """Return N^-1 applied to a map, without what the templates explain of it, uK^-1."""
-        found = self.precision * map_uk
-        if self.templates is not None:
-            found -= self.precision * (self._normal @ (self.templates @ found) @ self.templates)
-        return found
-
     @property
     def spins(self) -> list[int]:
         """Return the orders of the beam that act, but 0."""
         known = 0 if self.moments is None else min(self.response.mmax, self.moments.smax)
         return [s for s in range(1, known + 1) if self.response.factors[s].any()]
+
+    @cached_property
+    def _covariance(self) -> Matrix:
+        assert self.templates is not None  # the caller has asked
+        return covariance_of_amplitudes(self.templates, self.precision)
+
+    def without_templates(self, weighted: Map) -> Map:
+        """Return N^-1 d, uK^-1, without what the templates explain of d."""
+        if self.templates is None:
+            return weighted
+        return weighted - self.precision * (self._covariance @ (self.templates @ weighted) @ self.templates)
 
 
 class InverseCovariance:
@@ -176,7 +174,10 @@ class InverseCovariance:
 
     def weighted(self, maps: Maps, part: slice = slice(None)) -> Maps:
         """Return N^-1 applied to all maps, or to those of ``part``, uK^-1; what was subtracted has no weight."""
-        return np.stack([one.weighted(map_) for one, map_ in zip(self.maps[part], maps, strict=True)])
+        found: Maps = self.precision[part] * maps
+        for row, one in enumerate(self.maps[part]):
+            found[row] = one.without_templates(found[row])
+        return found
 
     def of_own(self, maps: Maps, part: slice) -> Alm:
         """Return P^t N^-1 applied to some maps, the others being zero; ``part`` says which they are."""
@@ -276,6 +277,13 @@ class InverseCovariance:
 
     def _precondition(self, vector: Vector) -> Vector:
         return _packed(self._preconditioner.apply(_unpacked(vector, self.lmax)), self.lmax)
+
+
+def covariance_of_amplitudes(templates: NDArray[np.float64], weight: Map) -> Matrix:
+    """Return (T^t W T)^-1 of templates, (K, npix), and weights, (npix,): (K, K), zero for what others explain."""
+    normal = weight * templates @ templates.T
+    scale = np.sqrt(np.outer(np.diag(normal), np.diag(normal)))
+    return divided(np.linalg.pinv(divided(normal, scale), RANK, hermitian=True), scale)
 
 
 def conjugate_gradients(
