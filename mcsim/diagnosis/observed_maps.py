@@ -75,8 +75,8 @@ class ObservedMaps(DataSet[Sequence[Map]]):
     def of_reference(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix]:
         """Return data of the skies of reference without effects and with them, shape (skies, p + E) each.
 
-        The dipole that effects leave in the only channel does there what it does in skies that the maps constrain: this
-        is known of the observed sky, if behind a mask by chance much of it looks like a dipole, other than its power.
+        What the dipole that effects leave in the only channel makes by products with the sky is known of the observed
+        one, unlike what they do to its power: it is that of skies that the maps constrain.
         """
         before, after = self.context.extended_reference(found), self.same_skies.of_reference(found)
         if left := self.same_skies.dipole_left(found):

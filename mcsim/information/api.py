@@ -231,7 +231,8 @@ def _candidates(
     """Return the analysis with every effect that applies, and those that are asked for, nuisances included."""
     if run.preparation:
         raise InputError(
-            "the limit is that of maps as they are made, but the run prepares its maps; leave [[preparation]] out."
+            "the limit is that of maps as they are made, but the run prepares its maps; leave [[preparation]] out, and "
+            "if it subtracts a dipole, give --unknown-dipole-uk 1000."
         )
     refuse_external(run)
     if settings.probes < 3:
