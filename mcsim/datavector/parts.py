@@ -14,6 +14,9 @@ from mcsim.support.arrays import Map, Matrix
 
 LEFT = 0.01  #: share of what was subtracted from maps that stays in :meth:`Part.without_response`
 
+TRACE = 1e-6
+"""The same where no map knows what was subtracted. The filtered sky has it, many times what the noise has of it."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -27,6 +30,7 @@ class Part:
     noise_power: float  # of the noise in the map's a_lm when its pixels count alike, uK^2 sr
     #: what its preparation fits and subtracts, shape (K, npix), and with which weights, if that counts
     subtracted: tuple[tuple[NDArray[np.float64], Map], ...] = ()
+    left: float = LEFT  #: share of it that stays in residuals
 
     def without_subtracted(self, map_uk: Map) -> Map:
         """Return a map from which all is subtracted once more: observed ones may have some of it, simulated none."""
@@ -37,10 +41,10 @@ class Part:
     def without_response(self, residual: Map) -> Map:
         """Return a residual whose products with signals are those with what the preparation leaves of these, uK^-1.
 
-        But for a share LEFT: scores of what is subtracted are small, and not mere rounding.
+        But for a share ``left``: scores of what is subtracted are small, and not mere rounding.
         """
         for columns, weight, covariance in reversed(self._fits):
-            residual = residual - (1.0 - LEFT) * weight * (covariance @ (columns @ residual) @ columns)
+            residual = residual - (1.0 - self.left) * weight * (covariance @ (columns @ residual) @ columns)
         return residual
 
     @cached_property
@@ -78,5 +82,5 @@ def marginalised(survey: Survey, parts: Sequence[Part]) -> tuple[Part, ...]:
     for part, own in zip(parts, regressions(survey), strict=True):
         columns = [one for one, _ in own]
         together = columns if len(columns) < 2 else [np.concatenate(columns)]
-        found.append(replace(part, subtracted=tuple((one, part.precision) for one in together)))
+        found.append(replace(part, subtracted=tuple((one, part.precision) for one in together), left=TRACE))
     return tuple(found)

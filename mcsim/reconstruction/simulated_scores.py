@@ -84,7 +84,7 @@ CODE = (
     "reconstruction.sky_changes",
     *(
         f"datavector.{name}"
-        for name in ("analysis", "matched_filters", "pixel_noise", "untouched_maps", "wiener_filter")
+        for name in ("analysis", "matched_filters", "parts", "pixel_noise", "untouched_maps", "wiener_filter")
     ),
 )
 """What scores of simulations are computed with."""

@@ -90,6 +90,9 @@ def test_masked_maps_without_their_dipole_are_filtered_as_if_it_were_not_known(r
     assert abs(exact - 1.0) < 4.0 * np.sqrt(2.0 / 99)
     assert isotropic > 1.2 * exact
     maps = list(simulate.maps(model.survey, 0))
+    for residual, part in zip(wiener_filter(model, maps).residual, model.parts, strict=True):
+        # Of the dipole there is a trace of what its noise alone would have.
+        assert 0.0 < abs(residual @ HEIGHT) < 1e-3 * np.sqrt(HEIGHT**2 @ part.precision)
     moved = [map_ + 40.0 * HEIGHT + 7.0 for map_ in maps]
     np.testing.assert_allclose(shared_sky(model, moved), shared_sky(model, maps), rtol=0, atol=1e-6)
 
