@@ -91,7 +91,7 @@ class Refiner:
             if not any(changed):
                 break
             found = self._attribute(now.t, now.candidates)
-        found = self._completed(now, found)
+        now, found = self._with_smaller(now, self._completed(now, found))
         for index in self._displaced(now, first, found):
             alone = self._alone(now, t, index)
             own = self._completed(alone, self._attribute(alone.t, alone.candidates))
@@ -130,6 +130,30 @@ class Refiner:
                 break
             found = self._attribute(now.t, now.candidates)
         return found
+
+    def _with_smaller(self, now: "_Responses", found: Attribution) -> tuple["_Responses", Attribution]:
+        """Return responses and attribution with a smaller set, if one suffices once it is simulated at its amplitudes.
+
+        Single candidates are simulated at theirs beforehand. What a bent response leaves of the data seems to be more
+        effects until it is simulated beside the others that act.
+        """
+        size = _size(found)
+        for members in self._nearly(now, size):
+            beside = _Responses(now.linear, now.t.copy(), [*now.candidates], {**now.done})
+            for index in members:
+                self._simulate_in_place(beside, tuple(one for one in members if one != index), index)
+            together = self._completed(beside, self._attribute(beside.t, beside.candidates))
+            if 0 < _size(together) < size:
+                return beside, together
+        return now, found
+
+    def _nearly(self, now: "_Responses", size: int) -> Iterator[tuple[int, ...]]:
+        """Yield sets of several members, fewer than a size, that explain nearly as much as the best of as many."""
+        chosen = self._selection(now.t, now.candidates)
+        for fewer in range(2, size):
+            ranked = chosen.most_probable(fewer, 2 * self.context.settings.tried)
+            most = max((fit.delta_chi2 for _, fit in ranked), default=0.0)
+            yield from (members for members, fit in ranked if fit.delta_chi2 >= NEARLY * most)
 
     def _alike(self, now: "_Responses", one: Explanation) -> list[tuple[tuple[int, ...], int]]:
         """Return candidates that were not simulated and are like a member of a set, behind the other members.
@@ -287,9 +311,11 @@ class Refiner:
         return search.beside(row, less)[0]
 
     def _attribute(self, t: Matrix, candidates: Sequence[Candidate]) -> Attribution:
+        return attributed(self._selection(t, candidates), self.data.gap)
+
+    def _selection(self, t: Matrix, candidates: Sequence[Candidate]) -> Selection:
         known = self.context
-        chosen = Selection(known.null, self.data.x, t, candidates, known.calibration, known.settings)
-        return attributed(chosen, self.data.gap)
+        return Selection(known.null, self.data.x, t, candidates, known.calibration, known.settings)
 
     def _together(self, candidates: Sequence[Candidate], t: Matrix, members: tuple[int, ...]) -> Matrix | None:
         """Return templates that are exact for effects that act together, at about their fitted amplitudes.
@@ -415,3 +441,8 @@ class Refiner:
         precision = np.linalg.pinv(covariance)
         moved, size = (float(v @ precision @ v) for v in (now - before, now))
         return moved < max(self.context.settings.settled_sigma**2, share**2 * size)
+
+
+def _size(found: Attribution) -> int:
+    """Return the number of members of the smallest set; 0 without one."""
+    return min((len(one.members) for one in found.explanations), default=0)

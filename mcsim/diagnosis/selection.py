@@ -265,6 +265,20 @@ class Selection:
             best = max([best, *(found.evidence for found in fresh)])
         return accepted
 
+    def most_probable(self, size: int, count: int) -> list[tuple[tuple[int, ...], Fit]]:
+        """Return the most probable sets of a size with their fits, whether they suffice or not."""
+        search = self.searches[0]
+        tried = list(search.rows(min(size, EXHAUSTIVE)))
+        for _ in range(EXHAUSTIVE, size):
+            tried = list(search.grown(tried))
+        found = [
+            (evidence, tuple(members))
+            for subsets in tried
+            for rows in chunks(subsets)
+            for evidence, members in zip(search.solve(rows).evidence.tolist(), rows.tolist(), strict=True)
+        ]
+        return [(members, self.fit(search, members)) for _, members in sorted(found, reverse=True)[:count]]
+
     @cached_property
     def searches(self) -> list[Subsets]:
         """Return a search of sets without a member whose scatter is known, and one of each combination of such members.

@@ -79,7 +79,8 @@ class Instrument:
         bank = SimpleNamespace(curvature=self.curvature)
         context = SimpleNamespace(null=self.null, calibration=self.calibration, bank=bank, settings=self.settings)
         own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter, "rescaled": lambda tables: False}
-        gap = global_test(self.null, x, self.null.whiten_groups(self.t, [(0,), (1,), (2,)]), self.calibration)
+        groups = self.null.whiten_groups(self.t, [one.columns for one in self.candidates])
+        gap = global_test(self.null, x, groups, self.calibration)
         data = SimpleNamespace(context=context, x=x, realizations=1, gap=gap, **own)
         return Refiner(data).run(self.t, self.candidates, sets)
 
@@ -147,6 +148,25 @@ def test_what_is_like_a_member_is_simulated_where_a_set_suffices_by_tolerance_al
     instrument.t[:, 2] = along
     assert [one.members for one in instrument.refined(x).attribution.explanations] == [(2,)]
     assert all(list(tables) == ["C"] for tables in instrument.analysis)
+
+
+def test_the_bent_response_of_one_of_two_is_not_explained_by_two_in_its_place():
+    """A is bent, which its templates do not know. C and D together have the straight response that A has beside B."""
+    instrument = Instrument(bend=0.04, cross=0.0)
+    own = instrument.response(15.0, 0.0)
+    x = own + 20.0 * instrument.t[:, 1]
+    along, across = own / np.linalg.norm(own), instrument.sideways[1]
+    instead = np.stack([along + across, along - across], axis=1) / np.sqrt(2.0)
+    instrument.t = np.concatenate([instrument.t[:, :2], instead], axis=1)
+    instrument.candidates = [Candidate(Push, name, (k,)) for k, name in enumerate("ABCD")]
+    groups = instrument.null.whiten_groups(instrument.t, [(0,), (1,), (2,), (3,)])
+    instrument.calibration, instrument.curvature = calibrate(instrument.null, groups), np.zeros((P, 4))
+    instrument.settings = DiagnosisSettings(tried=1)
+    plain = attribute(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration)
+    assert [one.members for one in plain.explanations] == [(1, 2, 3)]
+    best, *_ = instrument.refined(x).attribution.explanations
+    assert best.members == (0, 1)
+    assert best.fit.amplitudes == pytest.approx([15.0, 20.0], abs=0.5)
 
 
 def test_secants_of_a_power_do_not_swing_about_the_amplitude():
