@@ -73,14 +73,21 @@ def regressions(survey: Survey) -> list[list[tuple[NDArray[np.float64], Map]]]:
     return found
 
 
+def templates_of(survey: Survey) -> list[NDArray[np.float64] | None]:
+    """Return all that is fitted and subtracted from every map, shape (K, npix); None: nothing."""
+    found: list[NDArray[np.float64] | None] = []
+    for columns in ([one for one, _ in own] for own in regressions(survey)):
+        # One alone is the same array in all maps that have it.
+        found.append(np.concatenate(columns) if len(columns) > 1 else next(iter(columns), None))
+    return found
+
+
 def marginalised(survey: Survey, parts: Sequence[Part]) -> tuple[Part, ...]:
     """Return parts of maps that know nothing of what was subtracted from them.
 
     With the noise as weights the residual then has none of it, whatever the weights of the preparation were.
     """
-    found = []
-    for part, own in zip(parts, regressions(survey), strict=True):
-        columns = [one for one, _ in own]
-        together = columns if len(columns) < 2 else [np.concatenate(columns)]
-        found.append(replace(part, subtracted=tuple((one, part.precision) for one in together), left=TRACE))
-    return tuple(found)
+    return tuple(
+        replace(part, subtracted=() if own is None else ((own, part.precision),), left=TRACE)
+        for part, own in zip(parts, templates_of(survey), strict=True)
+    )

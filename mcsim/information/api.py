@@ -12,6 +12,7 @@ import numpy as np
 from mcsim import config, systematics
 from mcsim.datavector.analysis import Analysis, analysis_of, check_asked
 from mcsim.datavector.candidate import Candidate, numbered
+from mcsim.datavector.parts import keeps_pixels, templates_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.information import figure
@@ -25,6 +26,7 @@ from mcsim.simulation.channels import refuse_external
 from mcsim.simulation.filtering import unknown_dipole
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
 from mcsim.simulation.nuisance import nuisances_of
+from mcsim.simulation.survey import survey
 from mcsim.support import folders, page
 from mcsim.support.arrays import divided
 from mcsim.support.numbers import duration
@@ -65,7 +67,8 @@ def limit(
     Raises
     ------
     InputError
-        If the run has no white noise, no spectrum or no pixels, prepares its maps, or an effect is not known.
+        If the run has no white noise, no spectrum or no pixels, prepares its maps by more than fits that are
+        subtracted and masks of zeros and ones, or an effect is not known.
 
     Notes
     -----
@@ -105,7 +108,7 @@ def limit(
     nthreads = os.cpu_count() or 1
     run, settings = _with_declared(run, settings)
     analysis, candidates = _candidates(run, settings, nthreads)
-    filtered = inverse_covariance(analysis, settings, nthreads)
+    filtered = inverse_covariance(analysis, run, settings, nthreads)
     total = sum(len(candidate.columns) for candidate in candidates)
     cl = analysis.model.survey.cl
     assert cl is not None  # a model of the analysis has one
@@ -123,6 +126,8 @@ def limit(
         with reporting("random probes", steps, "responses", quiet) as report:
             information = stochastic(filtered, changes, cl, Probes(settings.probes, settings.seed), report)
         method = f"From {settings.probes} random probes"
+    if any(m.templates is not None for m in filtered.maps):
+        method += ", marginalised over what [[preparation]] subtracts from the maps"
     tests = sum(not _is_nuisance(candidate, settings) for candidate in analysis.candidates)
     found = limits_of(candidates, information, tests, method, run.name, settings)
     if output is not None:
@@ -134,7 +139,7 @@ def describe(run: config.RunConfig, settings: LimitSettings) -> str:
     """Return a text on the cost of a limit: components, probes, transforms, memory and time."""
     run, settings = _with_declared(run, settings)
     analysis, candidates = _candidates(run, settings, nthreads := os.cpu_count() or 1)
-    filtered = inverse_covariance(analysis, settings, nthreads)
+    filtered = inverse_covariance(analysis, run, settings, nthreads)
     columns, count = sum(len(candidate.columns) for candidate in candidates), len(filtered.maps)
     head = f"{run.name}: {len(candidates)} effects of {columns} components, {count} map{'s' if count > 1 else ''}"
     if settings.dense:
@@ -173,10 +178,21 @@ def widths(given: Iterable[str]) -> dict[str, float]:
     return found
 
 
-def inverse_covariance(analysis: Analysis, settings: LimitSettings, nthreads: int = 1) -> InverseCovariance:
-    """Return the inverse covariance of a model's maps; InputError for a channel without noise."""
+def inverse_covariance(
+    analysis: Analysis, run: config.RunConfig, settings: LimitSettings, nthreads: int = 1
+) -> InverseCovariance:
+    """Return the inverse covariance of the maps of an analysis, masked and fitted as the preparation of a run does it.
+
+    InputError for a channel without noise, and for other preparations.
+    """
     shared = analysis.model.survey
-    maps = []
+    prepared = survey(run, nthreads=nthreads, library=dict(analysis.library)) if run.preparation else shared
+    if not keeps_pixels(prepared):
+        raise InputError(
+            "the limit is that of white noise in the pixels of maps, which [[preparation]] changes; leave out its "
+            "steps but for templates and dipoles that are fitted and subtracted, and masks of zeros and ones."
+        )
+    maps, known = [], zip((m.weight for m in prepared.maps), templates_of(prepared), strict=True)
     for channel in shared.channels:
         if channel.side_b is not None:
             raise InputError(
@@ -185,6 +201,7 @@ def inverse_covariance(analysis: Analysis, settings: LimitSettings, nthreads: in
             )
         response = convolve.Response(channel.response.factors[: settings.orders + 1])
         for m in channel.maps:
+            weight, templates = next(known)
             if m.drawn is not None:
                 raise InputError(
                     f"the noise of map {m.name} is not white, and the limit is that of white noise; give channel "
@@ -195,9 +212,9 @@ def inverse_covariance(analysis: Analysis, settings: LimitSettings, nthreads: in
                     f"map {m.name} has no noise, so that nothing limits it; give channel {channel.name} a "
                     "noise.sigma0_uk above 0."
                 )
-            seen = m.moments.hits > 0 if m.weight is None else (m.moments.hits > 0) & (m.weight > 0.0)
+            seen = m.moments.hits > 0 if weight is None else (m.moments.hits > 0) & (weight > 0.0)
             precision = divided(seen, m.noise_uk**2)
-            maps.append(ObservedMap(response, precision, m.moments if settings.orders else None))
+            maps.append(ObservedMap(response, precision, m.moments if settings.orders else None, templates))
     assert shared.cl is not None  # a model of the analysis has one
     cl = unknown_dipole(shared.cl, settings.unknown_dipole_uk)
     return InverseCovariance(cl, maps, settings.tolerance, nthreads)
@@ -229,11 +246,6 @@ def _candidates(
     run: config.RunConfig, settings: LimitSettings, nthreads: int
 ) -> tuple[Analysis, tuple[Candidate, ...]]:
     """Return the analysis with every effect that applies, and those that are asked for, nuisances included."""
-    if run.preparation:
-        raise InputError(
-            "the limit is that of maps as they are made, but the run prepares its maps; leave [[preparation]] out, and "
-            "if it subtracts a dipole, give --unknown-dipole-uk 1000."
-        )
     refuse_external(run)
     if settings.probes < 3:
         raise InputError(f"probes = {settings.probes} are too few to tell an error; give 3 or more.")
@@ -257,7 +269,8 @@ def _candidates(
     usual = DiagnosisSettings(including=tuple(name for name in named if name in library))
     more = max(0, settings.orders - usual.beam_orders)
     fits = replace(usual, beam_orders=usual.beam_orders + more, beam_bins=(*usual.beam_bins, *(1,) * more))
-    analysis = analysis_of(run, settings.without, nthreads, fits, library)
+    # What is subtracted from maps is marginalised: derivatives are those of maps as they are made.
+    analysis = analysis_of(replace(run, preparation=()), settings.without, nthreads, fits, library)
     known = {c.name for c in analysis.candidates}
     known |= {f"{c.name}:{c.channel}" for c in analysis.candidates if c.channel is not None}
     for name in settings.nuisances:

@@ -90,10 +90,19 @@ def stochastic(
         whole, n = each.sum(axis=0), len(members)
         found.append(whole / (n * (n - 1)))
         left_out.append((whole - 2.0 * each) / ((n - 1) * (n - 2)) - found[-1])
-    first_half, second_half = zip(*(derivative.mean for derivative in derivatives), strict=True)
+    first_half, second_half = zip(*(means(filtered, derivative) for derivative in derivatives), strict=True)
     total = np.mean(found, axis=0) + _filtered_products(filtered, derivatives, first_half, second_half)
     total = (total + total.T) / 2.0
     return Information(total, tuple(total + change / len(found) for change in left_out))
+
+
+def means(filtered: InverseCovariance, derivative: Derivative) -> tuple[Maps, Maps]:
+    """Return both estimates of the derivative of the mean, without what templates of the maps explain of it."""
+    own = filtered.maps[derivative.maps]
+    first, second = (
+        np.stack([one.unexplained(row) for one, row in zip(own, maps, strict=True)]) for maps in derivative.mean
+    )
+    return first, second
 
 
 def _draw(filtered: InverseCovariance, cl: Cl, seed: int, number: int, x: Maps) -> Alm:
@@ -114,7 +123,7 @@ def _response(derivative: Derivative, x: Maps, sky: Alm) -> Maps:
 def _filtered_products(
     filtered: InverseCovariance, derivatives: Sequence[Derivative], left: Sequence[Maps], right: Sequence[Maps]
 ) -> Matrix:
-    """Return a_i' C^-1 b_j = a_i' N^-1 b_j - (P^t N^-1 a_i)' (S^-1 + P^t N^-1 P)^-1 (P^t N^-1 b_j)."""
+    """Return a_i' C^-1 b_j = a_i' N^-1 b_j - (P^t N^-1 a_i)' (S^-1 + P^t N^-1 P)^-1 (P^t N^-1 b_j) of :func:`means`."""
     own = [derivative.maps for derivative in derivatives]
     found = np.zeros((len(own), len(own)))
     seen = [filtered.of_own(maps, part) for maps, part in zip(left, own, strict=True)]

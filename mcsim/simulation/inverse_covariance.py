@@ -65,6 +65,14 @@ class ObservedMap:
             return weighted
         return weighted - self.precision * (self._covariance @ (self.templates @ weighted) @ self.templates)
 
+    def unexplained(self, map_uk: Map) -> Map:
+        """Return what the best fit of the templates leaves of a map, uK; nothing where that is rounding."""
+        if self.templates is None:
+            return map_uk
+        left = divided(self.without_templates(self.precision * map_uk), self.precision)
+        faint = self.precision @ left**2 <= RANK * (self.precision @ map_uk**2)
+        return np.zeros_like(map_uk) if faint else left
+
 
 class InverseCovariance:
     """Apply the inverse covariance of maps.
