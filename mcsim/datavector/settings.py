@@ -136,7 +136,8 @@ class DiagnosisSettings:
         Iterations of filling unobserved pixels with the filtered sky.
     hidden_share
         Share of the sky that a map lacks, as behind a mask, from which on maps are filtered by their inverse
-        covariance, and not isotropically. 0: always, which costs a quarter more for each simulation.
+        covariance, and not isotropically. 0: always, which costs a quarter more for each simulation. Maps that show the
+        sky beyond the filters have that of their mean in any case.
     filter_tolerance, filter_iterations
         At which the conjugate gradients of that filter end for typical maps: what is left of the system, relative to
         what the filter leaves of the sky, and number of iterations. Simulations and data go through the same ones, so

@@ -1,6 +1,6 @@
 """The data vector: a short vector of summary statistics, each with a description."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
 
@@ -90,6 +90,7 @@ KINDS = {
     "difference": "power of the split difference",
     "contrast": "contrast of frequencies",
     "sky": "power spectrum of the shared sky",
+    "fine": "power of the shared sky beyond the filter",
     "isotropy": "modulation of the shared sky",
     "matched": "matched filter",
     "biposh": "BipoSH of residual × sky",
@@ -108,6 +109,7 @@ UNITS = {
     "common": "uK^-2",
     "difference": "uK^-2",
     "contrast": "uK^2",
+    "fine": "uK^-2",
     "cross": "uK^-2",
     "table": "uK^2",
     "residual": "uK^-1",
@@ -131,6 +133,8 @@ def blocks_of(model: Model) -> tuple[Block, ...]:
         blocks += [_noise_block(model, channel), _linearity_block(model, channel)]
         if len(model.of(channel)) > 1:
             blocks.append(_repeated_block(model, channel))
+    if model.pooled and len(model.parts) > 1:
+        blocks.append(_mean_block(model))
     return (*blocks, *_contrast_blocks(model), _sky_block(model), _isotropy_block(model))
 
 
@@ -210,27 +214,68 @@ def _beam_block(model: Model, part: int) -> Block:
 
 def _lowest_block(model: Model, part: int) -> Block:
     """Measure the mean of the residual, and its dipole: x, y, z."""
-    whole = of_map(model, part)
-    mean = replace(whole, name=f"monopole/{whole.name}", ell=(0, 0), L=0, M=0, parity="even", kind="monopole")
-    alike = replace(whole, ell=(1, 1), L=1, kind="dipole")
-    dipole = [replace(alike, name=f"dipole/{alike.name}/{axis}", component=axis) for axis in "xyz"]
     one, two = alm_.start(model.lmax, 0) + 1, alm_.start(model.lmax, 1) + 1
 
     def values(filtered: FilteredMaps) -> Vector:
         alm = filtered.adjoint[part]
         return np.array([alm[0].real, -alm[two].real, alm[two].imag, alm[one].real])
 
-    return Block((mean, *dipole), values)
+    return Block(_lowest(of_map(model, part)), values)
+
+
+def _lowest(whole: Element) -> tuple[Element, ...]:
+    """Return the elements of the mean and of the dipole of what is described as a whole."""
+    mean = replace(whole, name=f"monopole/{whole.name}", ell=(0, 0), L=0, M=0, parity="even", kind="monopole")
+    alike = replace(whole, ell=(1, 1), L=1, kind="dipole")
+    return (mean, *(replace(alike, name=f"dipole/{alike.name}/{axis}", component=axis) for axis in "xyz"))
+
+
+def _mean_block(model: Model) -> Block:
+    """Measure what is left of the mean of pooled maps: its lowest degrees, the Galactic plane, its power by latitude.
+
+    The power is that of the sky beyond the filter, of which no other element knows.
+    """
+    name, end = "mean of maps", model.survey.config.sky.lmax
+    whole = Element(name, "map", model.channels, frame=model.frame)
+    profile, plane = _plane(model, whole)
+    forms = np.stack([np.ones(profile.size), *healpix.centres(model.nside), profile])
+    power = replace(whole, statistic="cl", ell=(model.lmax + 1, end), L=0, frame="galactic", kind="fine")
+    seen = np.any([part.precision > 0 for part in model.parts], axis=0)
+    height = np.abs(sine_of_latitude(model.frame, "galactic", model.nside))
+    rows, elements = [], []
+    for fold, which, words, band in _bands(model, height, seen):
+        rows.append(band)
+        elements.append(replace(power, name=f"fine/{which}", fold=fold, component=f"|sin b| {words}"))
+    bands = np.stack(rows).astype(float)
+
+    def values(filtered: FilteredMaps) -> Vector:
+        assert filtered.mean is not None  # of pooled maps
+        return np.concatenate([forms @ filtered.mean, bands @ filtered.mean**2])
+
+    return Block((*_lowest(whole), plane, *elements), values)
+
+
+def _bands(model: Model, height: Map, seen: NDArray[np.bool_]) -> Iterator[tuple[int, str, str, NDArray[np.bool_]]]:
+    """Yield fold, name, words and pixels of bands of a height, alternate pixels apart, where something is seen."""
+    for half, (low, high) in product((0, 1), pairwise(model.settings.latitude_edges)):
+        band = seen & (height >= low) & (height <= high) & (np.arange(height.size) % 2 == half)
+        if band.any():
+            words = f"{low:g}–{high:g}, {'odd' if half else 'even'} pixels"
+            yield half, f"{low:g}-{high:g}/pixels{half}", words, band
 
 
 def _plane_block(model: Model, part: int) -> Block:
     """Measure the residual along the Galactic plane, against its mean over the sky."""
-    profile = 1.0 / (1.0 + (sine_of_latitude(model.frame, "galactic", model.nside) / model.settings.plane_width) ** 2)
-    profile -= profile.mean()
-    ends = 2, min(model.settings.large_scales, model.lmax)
-    whole = replace(of_map(model, part), ell=ends, frame="galactic", kind="plane")
-    element = replace(whole, name=f"plane/{whole.name}", L=2, M=0, parity="even")
+    profile, element = _plane(model, of_map(model, part))
     return Block((element,), lambda filtered: float(filtered.residual[part] @ profile))
+
+
+def _plane(model: Model, whole: Element) -> tuple[Map, Element]:
+    """Return the profile of the Galactic plane, of mean zero, and its element of what is described as a whole."""
+    profile = 1.0 / (1.0 + (sine_of_latitude(model.frame, "galactic", model.nside) / model.settings.plane_width) ** 2)
+    ends = 2, min(model.settings.large_scales, model.lmax)
+    element = replace(whole, name=f"plane/{whole.name}", ell=ends, L=2, M=0, parity="even")
+    return profile - profile.mean(), replace(element, frame="galactic", kind="plane")
 
 
 def _noise_block(model: Model, channel: int) -> Block:
@@ -239,14 +284,10 @@ def _noise_block(model: Model, channel: int) -> Block:
     height = np.abs(sine_of_latitude(model.frame, "ecliptic", model.nside))
     seen = np.all([model.parts[i].precision > 0 for i in parts[:2]], axis=0)
     rows, elements = [], []
-    for half, (low, high) in product((0, 1), pairwise(model.settings.latitude_edges)):
-        band = seen & (height >= low) & (height <= high) & (np.arange(height.size) % 2 == half)
-        if not band.any():
-            continue  # behind a mask, or never scanned
+    for fold, which, words, band in _bands(model, height, seen):
         rows.append(band.astype(float))
-        own = Element(f"noise/{name}/{low:g}-{high:g}/pixels{half}", "noise", (name,), fold=half, L=0, kind="noise")
-        words = f"|sin β| {low:g}–{high:g}, {'odd' if half else 'even'} pixels"
-        elements.append(replace(own, frame="ecliptic", component=words))
+        own = Element(f"noise/{name}/{which}", "noise", (name,), fold=fold, L=0, kind="noise")
+        elements.append(replace(own, frame="ecliptic", component=f"|sin β| {words}"))
     bands = np.reshape(rows, (-1, height.size))  # none, if two maps have no pixel in common
     return Block(tuple(elements), lambda filtered: np.asarray(bands @ filtered.difference[channel]))
 

@@ -6,8 +6,10 @@ With d_i the maps, P_i the fiducial response of map i (beam, pixel window, centr
 
 On the full sky the first inverse is taken as if noise were isotropic, which costs little. Behind a mask it would cost
 much, and is that of the noise of every pixel, by conjugate gradients (Model.inverse). What describes unlisted effects
-has it on every sky, with the offsets of the samples (Model.exact). Of maps that show the sky beyond the filter's last
-degree it has that of their mean, and takes what all of them have alike in a pixel for sky (Model._of_mean).
+has it on every sky, with the offsets of the samples (Model.exact). Maps that show the sky beyond the filter's last
+degree are filtered by the inverse covariance of their mean, in which that sky is noise of pixels, and what all of them
+have alike in a pixel is taken for sky (_pooled): the isotropic filter leaves it in all residuals, and most effects then
+need 1.3 to 2 times the amplitude.
 
 The matched filter of any small change dP_i of a response is <r_i, dP_i s^>: the filtered sky of *all* maps stands in
 for the sky, so that noise limits it, not cosmic variance as for the spectra of a single sky. A change of the beam,
@@ -31,11 +33,11 @@ from mcsim.errors import InputError
 from mcsim.simulation import convolve
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
 from mcsim.simulation.noise import NoiseOfFiles
-from mcsim.simulation.survey import Channel, Survey, SurveyMap
+from mcsim.simulation.survey import Channel, Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
-from mcsim.support.arrays import Alm, Cl, Map, Matrix, divided
+from mcsim.support.arrays import Alm, Cl, Map, Matrix, Vector, divided
 
 FAINT = 0.1
 """Power of the sky over that of the noise at the last degree of the filters; what is above adds below 1 % to sigmas."""
@@ -45,7 +47,7 @@ SHARP = 30.0
 """Power of the sky over that of the noise at the last degree, up to which conjugate gradients converge soon: the
 preconditioner has no such sharp end (:class:`mcsim.simulation.preconditioner.Preconditioner`)."""
 
-EXACT = 0.1  #: filter_tolerance of the exact filter
+CAREFUL = 0.1  #: filter_tolerance of the exact filter and of pooled maps, over that of the others
 
 TAIL = 1e-3  #: part of the squared S/N of a change of a beam that is left beyond the last degree of its order
 EARLIEST = 16  #: degree at which orders may end: bins have degrees
@@ -63,13 +65,9 @@ class Model:
     response: Matrix  # B_l w_l of every channel, (channel, lmax + 1)
     parts: tuple[Part, ...]  # the maps in order
     dipole: Alm  # that the survey sees besides, up to lmax, uK
-    #: of all maps, if they lack a part of the sky, or of their mean, if pooled; None, and of maps whose noise is not
-    #: white or that show the sky beyond lmax: the isotropic filter
+    #: of all maps, if they lack a part of the sky, or of their mean, if pooled; None: the isotropic filter
     inverse: InverseCovariance | None
-    white: bool  # the noise of pixels is independent, and the maps do not show the sky beyond lmax
-    #: amplitude in every channel of the sky beyond lmax, sqrt(C_l) B_l w_l, uK, (channel, sky.lmax + 1); 0 if maps do
-    #: not show it or their noise is not white
-    unresolved: NDArray[np.float64]
+    exact_known: bool  # the noise of pixels is independent, and the sky beyond lmax not shown, or pooled
     sky_power: Cl  # of s^: E|s^_lm|^2 / C_l = C_l / (C_l + N_l) in the isotropic approximation
     settings: DiagnosisSettings
     #: s^ is that of the mean of all maps, and what they have alike beside it is sky beyond lmax, of this variance, uK^2
@@ -114,46 +112,12 @@ class Model:
 
     @cached_property
     def exact(self) -> "Model":
-        """Return the model with the inverse covariance of all maps, samples' offsets included, if it is known.
-
-        It is if noise is white, and of maps that show the sky beyond lmax (:meth:`_of_mean`). Its filter goes on until
-        what all maps have alike, which is nearly all sky, is known to a tenth of its residual.
-        """
-        if self.pooled or not self.has_exact:
+        """Return the model with the inverse covariance of all maps, samples' offsets included, if it is known."""
+        if self.pooled or not self.exact_known:
             return self
-        if not self.white:
-            return self._of_mean()
         parts = marginalised(self.survey, self.parts)
         inverse = inverse_of(self.cl, self.response, parts, offsets=True)
-        settings = replace(self.settings, filter_tolerance=EXACT)
-        return replace(self, parts=parts, inverse=inverse, settings=settings)
-
-    @property
-    def has_exact(self) -> bool:
-        """Return True if scores of :attr:`exact` have the variance of their response."""
-        return self.white or bool(self.unresolved.any())
-
-    def _of_mean(self) -> "Model":
-        """Return the model with the inverse covariance of the mean of all maps, which show the sky beyond lmax.
-
-        In the mean this sky is noise, independent from pixel to pixel. What a beam makes of it otherwise than the
-        others is noise of its own maps.
-        """
-        weights = [1.0 / part.noise_power for part in self.parts]
-        response, shared = (
-            np.average([rows[part.channel] for part in self.parts], axis=0, weights=weights)
-            for rows in (self.response, self.unresolved)
-        )
-        own, alike = [_variance(one - shared) for one in self.unresolved], _variance(shared)
-        parts = [
-            replace(part, precision=part.precision / (1.0 + own[part.channel] * part.precision), subtracted=tuple(one))
-            for part, one in zip(self.parts, regressions(self.survey), strict=True)
-        ]
-        total = np.sum([part.precision for part in parts], axis=0)
-        mean = replace(parts[0], channel=0, precision=total / (1.0 + alike * total), subtracted=())
-        settings = replace(self.settings, filter_tolerance=EXACT)
-        inverse = inverse_of(self.cl, response[None], [mean])
-        return replace(self, parts=tuple(parts), inverse=inverse, settings=settings, pooled=alike)
+        return replace(self, parts=parts, inverse=inverse, settings=_careful(self.settings))
 
     def of(self, channel: int) -> tuple[int, ...]:
         """Return the indices of the channel's maps."""
@@ -173,6 +137,7 @@ class FilteredMaps:
     orders: NDArray[np.complex128]
     difference: NDArray[np.float64]  # u^2 - 1 of every pixel, (channel, npix): pixel_noise.fill_difference
     squares: NDArray[np.float64]  # N_i r_i^2 summed over maps, (channel, npix): pixel_noise.add_squares
+    mean: Map | None = None  # residual of the mean of pooled maps, uK^-1, (npix,)
 
 
 def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
@@ -211,22 +176,59 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     snr = survey.cl * sum(response[part.channel] ** 2 / part.noise_power for part in parts)
     lmax = _highest_degree(survey, snr)
     hidden = max(float(np.mean(part.precision == 0.0)) for part in parts)
-    known = keeps_pixels(survey) and bool(np.all(snr[lmax + 1 :] <= 1.0) and snr[lmax] <= SHARP)
-    white = all(_has_white_noise(m) for channel in survey.channels for m in channel.maps)
-    beyond = (np.arange(snr.size) > lmax) * (white and np.any(snr[lmax + 1 :] > 1.0))
-    unresolved = beyond * np.sqrt(survey.cl) * response
+    pixels = all(m.preparation is None or m.preparation.keeps_noise_white for m in survey.maps)
+    white = pixels and all(m.drawn is None and m.pairs is None for m in survey.maps)
+    bright = bool(np.any(snr[lmax + 1 :] > 1.0))
+    unresolved = (np.arange(snr.size) > lmax) * np.sqrt(survey.cl) * response
     cl, response, snr = survey.cl[: lmax + 1], response[:, : lmax + 1], snr[: lmax + 1]
-    dipole = dipole_alm(survey.channels[0].site.dipole_uk, lmax)
-    inverse = None
+    known, inverse = pixels and not bright and bool(snr[lmax] <= SHARP), None
     if known and hidden >= settings.hidden_share:
         parts = list(marginalised(survey, parts))
         inverse = inverse_of(cl, response, parts)
-    maps = survey.nside, cl, response, tuple(parts), dipole
-    return Model(survey, lmax, *maps, inverse, known and white, unresolved, snr / (1.0 + snr), settings)
+    maps = survey.nside, cl, response, tuple(parts), dipole_alm(survey.channels[0].site.dipole_uk, lmax)
+    model = Model(survey, lmax, *maps, inverse, known and white, snr / (1.0 + snr), settings)
+    return replace(_pooled(model, unresolved), exact_known=white) if pixels and bright else model
 
 
-def _has_white_noise(m: SurveyMap) -> bool:
-    return m.drawn is None and m.pairs is None and (m.preparation is None or not m.preparation.transforms)
+def _pooled(model: Model, unresolved: Matrix) -> Model:
+    """Return a model with the inverse covariance of the mean of all maps, which show the sky beyond lmax.
+
+    ``unresolved``: the amplitude of this sky in every channel, sqrt(C_l) B_l w_l, uK, shape (channel, sky.lmax + 1). In
+    the mean it is noise, independent from pixel to pixel. What a beam makes of it otherwise than the others is noise of
+    its own maps.
+    """
+    shared = _mean(unresolved, model.parts)
+    own, alike = [_variance(one - shared) for one in unresolved], _variance(shared)
+    parts = [
+        replace(part, precision=part.precision / (1.0 + own[part.channel] * part.precision), subtracted=tuple(one))
+        for part, one in zip(model.parts, regressions(model.survey), strict=True)
+    ]
+    total = np.sum([part.precision for part in parts], axis=0)
+    response, precision = _mean(model.response, model.parts), total / (1.0 + alike * total)
+    snr = model.cl * response**2 * precision.sum() / (4.0 * np.pi)
+    return replace(
+        model,
+        parts=tuple(parts),
+        inverse=_of_mean(model.cl, response, precision),
+        sky_power=snr / (1.0 + snr),
+        settings=_careful(model.settings),
+        pooled=alike,
+    )
+
+
+def _careful(settings: DiagnosisSettings) -> DiagnosisSettings:
+    """Return settings with which what all maps have alike, nearly all sky, is known to a tenth of the rest."""
+    return replace(settings, filter_tolerance=CAREFUL * settings.filter_tolerance)
+
+
+def _mean(rows: Matrix, parts: Sequence[Part]) -> Vector:
+    """Return the mean over all maps of what every channel has, shape (channel, n): (n,)."""
+    weights = [1.0 / part.noise_power for part in parts]
+    return np.asarray(np.average([rows[part.channel] for part in parts], axis=0, weights=weights))
+
+
+def _of_mean(cl: Cl, response: Vector, precision: Map) -> InverseCovariance:
+    return InverseCovariance(cl, [ObservedMap(convolve.Response(response[None].astype(np.complex128)), precision)])
 
 
 def inverse_of(cl: Cl, response: Matrix, parts: Sequence[Part], offsets: bool = False) -> InverseCovariance:
@@ -287,7 +289,7 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
     clean, seen = _clean(model, maps)
     sky = _sky(model, clean)
     looked_at = sky + model.dipole
-    expected = _expected(model, clean, sky)
+    expected, mean = _expected(model, clean, sky)
     residual, adjoint = np.empty_like(expected), np.empty((len(model.parts), sky.size), dtype=np.complex128)
     up_to = cache(lambda last: alm_.resize(looked_at, lmax, last))
     scratch = np.empty((2, expected.shape[1]))
@@ -312,14 +314,18 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
             orders[i, s, : last + 1] = -2.0 * (window * k)[: last + 1] * both
     difference, squares = np.zeros((2, len(model.channels), expected.shape[1]))
     for channel in range(len(model.channels)):
-        own = [(residual[i], model.parts[i].precision) for i in model.of(channel)]
+        # What is fitted and subtracted may depend on pixels without weight.
+        parts = [(model.parts[i], residual[i]) for i in model.of(channel)]
+        own = [(np.where(p.precision > 0.0, r, 0.0) if p.subtracted else r, p.precision) for p, r in parts]
         pixel_noise.fill_difference(own, difference[channel])
         pixel_noise.add_squares(own, squares[channel])
-    return FilteredMaps(sky, expected, residual, adjoint, orders, difference, squares)
+    return FilteredMaps(sky, expected, residual, adjoint, orders, difference, squares, mean)
 
 
-def _expected(model: Model, clean: Sequence[Map], sky: Alm) -> NDArray[np.float64]:
+def _expected(model: Model, clean: Sequence[Map], sky: Alm) -> tuple[NDArray[np.float64], Map | None]:
     """Return what the maps show of a sky, uK, shape (map, npix); pooled maps what they have alike beside it, too.
+
+    With it stands the residual of the mean of pooled maps, C^-1 of it, uK^-1, shape (npix,); None of others.
 
     Notes
     -----
@@ -334,10 +340,12 @@ def _expected(model: Model, clean: Sequence[Map], sky: Alm) -> NDArray[np.float6
             expected[i] = made.map(through)
             if model.parts[i].moments.dtheta is not None:
                 expected[i] += convolve.centroid_map(made.gradient(through), model.parts[i].moments)
-    if model.pooled:
-        left, precision = _summed(model, [map_ - own for map_, own in zip(clean, expected, strict=True)])
-        expected += model.pooled * left / (1.0 + model.pooled * precision)
-    return expected
+    if not model.pooled:
+        return expected, None
+    left, precision = _summed(model, [map_ - own for map_, own in zip(clean, expected, strict=True)])
+    mean = left / (1.0 + model.pooled * precision)
+    expected += model.pooled * mean
+    return expected, mean
 
 
 def _summed(model: Model, maps: Sequence[Map]) -> tuple[Map, Map]:
@@ -355,6 +363,9 @@ def shared_sky(model: Model, maps: Sequence[Map]) -> Alm:
     between degrees adds power to s^: skies that it constrains had 2 % too much at l > 2.2 nside, and responses in them
     were 0.8 % too large. One iteration of the analysis takes most of it away where the filter is isotropic.
     """
+    # The inverse covariance of a mean takes the sky beyond for more noise of other degrees than it is: of a constrained
+    # sky that is filtered so, a fifth of the power would be missing at the last degrees.
+    model = replace(model, inverse=None, pooled=0.0) if model.pooled else model
     return _sky(model, _clean(model, maps)[0], careful=True)
 
 

@@ -305,7 +305,7 @@ def _scene(fiducial: str, without: tuple[str, ...], settings: DiagnosisSettings,
 def search_of(analysis: Analysis, scene: Scene, ask: Ask) -> Search:
     """Return the search of the maps of a model."""
     null, count = null_scores(analysis, ask), len(scene.keys)
-    scores_, exact = null[:, :count], analysis.model.has_exact
+    scores_, exact = null[:, :count], analysis.model.exact_known
     return Search(_seen(scene, scores_), scores_, _charged(scene, null[:, count:]), exact)
 
 

@@ -49,6 +49,11 @@ class Preparation:
             for one in self.steps
         )
 
+    @property
+    def keeps_noise_white(self) -> bool:
+        """Return True if no step is in harmonics, or weights pixels otherwise than as a whole."""
+        return not self.transforms and all(one.whole for one in self.steps if isinstance(one, Weighted))
+
     def apply(self, map_uk: Map) -> Map:
         """Return the prepared map, uK, ``healpy.UNSEEN`` where nothing was observed, before as after."""
         check_map(map_uk)

@@ -11,10 +11,12 @@ from mcsim import config
 from mcsim.config.noise import NoiseCorrelated
 from mcsim.datavector.parts import LEFT
 from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.summaries import blocks_of
 from mcsim.datavector.wiener_filter import model_of, shared_sky, wiener_filter
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
+from mcsim.sphere.sky import gaussian_alm
 
 NSIDE, LMAX = 16, 32
 CUT = 0.3  #: sine of the latitude up to which the equator is hidden
@@ -110,11 +112,11 @@ def test_the_exact_filter_knows_the_noise_and_the_offsets_of_samples(run, hidden
 
 def test_the_exact_filter_is_of_white_noise_alone(run):
     model = modelled(run)
-    assert model.white
+    assert model.exact_known
     assert model.exact.inverse.maps[0].moments is not None
     stripes = NoiseCorrelated(sigma0_uk=200.0, f_knee_hz=1e-3, f_min_hz=1e-5)
     unknown = modelled(replace(run, channels=(replace(run.channels[0], noise=stripes), *run.channels[1:])))
-    assert not unknown.white
+    assert not unknown.exact_known
     assert unknown.exact is unknown
 
 
@@ -125,6 +127,15 @@ def test_maps_that_keep_the_isotropic_filter(run):
     assert whole.inverse is not None
     quiet = tuple(replace(one, noise=replace(one.noise, sigma0_uk=1.0)) for one in run.channels)
     assert modelled(replace(run, channels=quiet)).inverse is None  # the sky is far above the noise at the last degree
+
+
+def elements_of(model):
+    return [element for block in blocks_of(model) for element in block.elements]
+
+
+def vector_of(model, maps):
+    filtered = wiener_filter(model, maps)
+    return np.concatenate([np.atleast_1d(block.values(filtered)) for block in blocks_of(model)])
 
 
 @pytest.fixture(scope="module")
@@ -143,13 +154,14 @@ def bright(run):
 @pytest.mark.parametrize("degree", [2, 4])
 def test_the_score_of_a_signal_in_bright_prepared_maps_has_the_variance_of_its_response(bright, degree):
     """What all maps have alike beyond the filter's last degree is noise of their mean, and none of a difference."""
-    assert bright.has_exact
-    assert not bright.white
+    assert bright.exact_known
+    assert bright.exact is bright
     height = healpy.pix2vec(8, np.arange(12 * 8**2))[2]
     legendre = np.polynomial.legendre.Legendre.basis(degree)(height)
     prepared = bright.survey.maps[0].preparation
     pattern = prepared.steps[1].apply(legendre)
-    exact, isotropic = excesses(bright, np.where(bright.parts[0].precision > 0.0, pattern, 0.0), bright.exact, bright)
+    pattern = np.where(bright.parts[0].precision > 0.0, pattern, 0.0)
+    exact, isotropic = excesses(bright, pattern, bright, replace(bright, inverse=None, pooled=0.0))
     assert abs(exact - 1.0) < 4.0 * np.sqrt(2.0 / 99)
     assert isotropic > 4.0 * exact
 
@@ -164,9 +176,38 @@ def test_the_score_of_a_signal_in_prepared_maps_is_that_of_what_the_preparation_
         assert residual @ signal == pytest.approx(before @ (left + LEFT * (signal - left)), rel=1e-9)
 
 
-def test_noise_with_memory_keeps_the_isotropic_filter_of_bright_maps(bright):
+def test_the_power_of_the_sky_beyond_the_filter_is_measured(bright):
+    """Four fifths of its amplitude have 16/25 of the power."""
+    elements, made = elements_of(bright), bright.survey
+    fine = [place for place, one in enumerate(elements) if one.kind == "fine"]
+    assert len(fine) == 2 * (len(bright.settings.latitude_edges) - 1)
+    assert {elements[place].ell for place in fine} == {(bright.lmax + 1, made.config.sky.lmax)}
+    weaker = np.where(np.arange(made.cl.size) > bright.lmax, 0.8, 1.0)
+    power = np.zeros(2)
+    for number in range(4):
+        sky = gaussian_alm(made.cl, np.random.default_rng(number))
+        for which, seen in enumerate((sky, alm_.multiply(sky, weaker, made.config.sky.lmax))):
+            maps = list(simulate.maps(made.without_noise, number, sky=seen))
+            power[which] += vector_of(bright, maps)[fine].sum()
+    assert power[1] / power[0] == pytest.approx(0.64, abs=0.05)
+
+
+def test_what_is_subtracted_may_depend_on_pixels_that_a_mask_hides(bright):
+    """Their residuals, over noise that they have not, ended in a division by zero."""
+    run = bright.survey.config
+    whole = replace(run, preparation=(run.preparation[0], replace(run.preparation[1], mask=None, mask_frame=None)))
+    model = modelled(whole)
+    maps = list(simulate.maps(model.survey, 0))
+    filtered = wiener_filter(model, maps)
+    hidden = model.parts[0].precision == 0.0
+    assert np.any(filtered.residual[0][hidden] != 0.0)
+    assert np.all(filtered.difference[:, hidden] == 0.0)
+    assert np.all(filtered.squares[:, hidden] == 0.0)
+
+
+def test_noise_with_memory_has_no_exact_scores_in_bright_maps(bright):
     stripes = NoiseCorrelated(sigma0_uk=60.0, f_knee_hz=1e-3, f_min_hz=1e-5)
     run = bright.survey.config
     unknown = modelled(replace(run, channels=(replace(run.channels[0], noise=stripes), *run.channels[1:])))
-    assert not unknown.has_exact
+    assert not unknown.exact_known
     assert unknown.exact is unknown
