@@ -40,7 +40,7 @@ def main() -> None:
         found = []
         for k in range(count):
             x = analysis.data_vector(maps(k))
-            found.append(global_test(context.null, x, context.groups, context.calibration).pvalue)
+            found.append(global_test(context.null, x, context.always, context.calibration).pvalue)
         p = np.array(found)
         low, ks = [int(np.sum(p <= level)) for level in (0.05, 0.01)], stats.kstest(p, "uniform").pvalue
         print(f"{how}: {low[0]} of {count} with p <= 0.05, {low[1]} with p <= 0.01; KS {ks:.2g}", flush=True)

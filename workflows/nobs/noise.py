@@ -149,13 +149,13 @@ def main() -> None:
         for low, high in pairwise(quartile)
         if (own := clean & (mean >= low) & (mean <= high)).any()
     ]
-    control = []
+    each = []
     for realization in range(arguments.skies):
         sky = simulated(n_obs, realization)
         for first in range(0, sky.size - PIXELS, PIXELS):
             own = estimates(sky[first : first + PIXELS], n_obs, first, clean, xi)
-            control.append([estimate for estimate, _ in own])
-    control = np.array(control)
+            each.append([estimate for estimate, _ in own])
+    control = np.array(each)
     report(data, by_hits, control, int(clean.sum()))
     if arguments.json:
         result = {"data": data, "by_hits": by_hits, "control_mean": control.mean(axis=0).tolist(),

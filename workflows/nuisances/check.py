@@ -112,7 +112,7 @@ def learned(run: mcsim.RunConfig, ask: Ask) -> DiagnosisContext:
 
 def pvalue(known: DiagnosisContext, x: np.ndarray) -> float:
     """Return the global p-value of a data vector."""
-    return global_test(known.null, x, known.groups, known.calibration).pvalue
+    return global_test(known.null, x, known.always, known.calibration).pvalue
 
 
 def summary(pvalues: Sequence[float]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from check import PUT_IN, model
+from check import PUT_IN, model  # type: ignore[attr-defined]  # there are several of this name
 
 from mcsim import systematics
 from mcsim.simulation import convolve, differencing, simulate

@@ -131,7 +131,7 @@ def null(number):
             more, wider = simulated_scores.with_peaks(context.analysis, scene, search, maps, scored)
             found = wider.run(simulated_scores.scores_of_maps(model, more, maps))
             x = context.analysis.data_vector(maps)
-            p = global_test(context.null, x, context.groups, context.calibration).pvalue
+            p = global_test(context.null, x, context.always, context.calibration).pvalue
             print(json.dumps(["null", which, p, [one.pvalue for one in found]]), flush=True)
 
 

@@ -37,7 +37,7 @@ def main() -> None:
     shared, found = DisturbedSurvey.of(drawn.run, dict(analysis.library)), []
     for number in range(chosen.count):
         x = analysis.data_vector(list(simulate.maps(shared.at(number), number)))
-        p = global_test(known.null, x, known.groups, known.calibration).pvalue
+        p = global_test(known.null, x, known.always, known.calibration).pvalue
         found.append(Control(p, "none" if p > known.settings.alpha else "unknown", ()))
     print(Controls(tuple(found), drawn.words, known.settings.alpha).counted)
     pvalues = np.array([one.pvalue for one in found])
