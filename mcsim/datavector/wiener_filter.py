@@ -364,7 +364,7 @@ def shared_sky(model: Model, maps: Sequence[Map]) -> Alm:
     were 0.8 % too large. One iteration of the analysis takes most of it away where the filter is isotropic.
     """
     # The inverse covariance of a mean takes the sky beyond for more noise of other degrees than it is: of a constrained
-    # sky that is filtered so, a fifth of the power would be missing at the last degrees.
+    # sky that is filtered so, a quarter of the power would be missing at the last degrees.
     model = replace(model, inverse=None, pooled=0.0) if model.pooled else model
     return _sky(model, _clean(model, maps)[0], careful=True)
 
