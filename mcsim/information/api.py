@@ -192,29 +192,28 @@ def inverse_covariance(
             "the limit is that of white noise in the pixels of maps, which [[preparation]] changes; leave out its "
             "steps but for templates and dipoles that are fitted and subtracted, and masks of zeros and ones."
         )
-    maps, known = [], zip((m.weight for m in prepared.maps), templates_of(prepared), strict=True)
-    for channel in shared.channels:
+    made = [(channel, m) for channel in shared.channels for m in channel.maps]
+    maps = []
+    for (channel, m), analysed, templates in zip(made, prepared.maps, templates_of(prepared), strict=True):
         if channel.side_b is not None:
             raise InputError(
                 f"channel {channel.name} reads differences of two beams, whose maps have noise that is not white; "
                 'describe the map by a scan of kind "hit_averaged" or "moments".'
             )
+        if m.drawn is not None:
+            raise InputError(
+                f"the noise of map {m.name} is not white, and the limit is that of white noise; give channel "
+                f'{channel.name} noise of kind "white", "depth", "variance" or "difference".'
+            )
+        if m.noise_uk is None:
+            raise InputError(
+                f"map {m.name} has no noise, so that nothing limits it; give channel {channel.name} a "
+                "noise.sigma0_uk above 0."
+            )
+        seen = m.moments.hits > 0 if analysed.weight is None else (m.moments.hits > 0) & (analysed.weight > 0.0)
         response = convolve.Response(channel.response.factors[: settings.orders + 1])
-        for m in channel.maps:
-            weight, templates = next(known)
-            if m.drawn is not None:
-                raise InputError(
-                    f"the noise of map {m.name} is not white, and the limit is that of white noise; give channel "
-                    f'{channel.name} noise of kind "white", "depth", "variance" or "difference".'
-                )
-            if m.noise_uk is None:
-                raise InputError(
-                    f"map {m.name} has no noise, so that nothing limits it; give channel {channel.name} a "
-                    "noise.sigma0_uk above 0."
-                )
-            seen = m.moments.hits > 0 if weight is None else (m.moments.hits > 0) & (weight > 0.0)
-            precision = divided(seen, m.noise_uk**2)
-            maps.append(ObservedMap(response, precision, m.moments if settings.orders else None, templates))
+        moments = m.moments if settings.orders else None
+        maps.append(ObservedMap(response, divided(seen, m.noise_uk**2), moments, templates))
     assert shared.cl is not None  # a model of the analysis has one
     cl = unknown_dipole(shared.cl, settings.unknown_dipole_uk)
     return InverseCovariance(cl, maps, settings.tolerance, nthreads)
