@@ -64,9 +64,12 @@ class BipolarScan:
         """Return what is correlated with the sky: itself, and sum and (sign -1) difference of a channel's residuals."""
         sky = Element("sky", "biposh", self.model.channels, kind="biposh")
         found: list[tuple[Element, int | None, float]] = [(sky, None, 1.0)]
+        # What the inverse covariance leaves of the only channel in all is S^-1 s^, the sky once more.
+        alone = len(self.model.channels) == 1 and self.model.inverse is not None
         for channel, name in enumerate(self.model.channels):
             own = Element(name, "biposh", (name,), kind="biposh")
-            found.append((own, channel, 1.0))
+            if not alone:
+                found.append((own, channel, 1.0))
             if len(self.model.of(channel)) > 1:
                 found.append((replace(own, name=f"{name} difference", split="difference"), channel, -1.0))
         return found

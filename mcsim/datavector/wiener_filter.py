@@ -47,7 +47,9 @@ SHARP = 30.0
 """Power of the sky over that of the noise at the last degree, up to which conjugate gradients converge soon: the
 preconditioner has no such sharp end (:class:`mcsim.simulation.preconditioner.Preconditioner`)."""
 
-CAREFUL = 0.1  #: filter_tolerance of the exact filter and of pooled maps, over that of the others
+CAREFUL = 0.1
+"""Tolerance of the exact filter and of pooled maps, over that of the others: what all maps have alike, nearly all sky,
+is known to a tenth of the rest."""
 
 TAIL = 1e-3  #: part of the squared S/N of a change of a beam that is left beyond the last degree of its order
 EARLIEST = 16  #: degree at which orders may end: bins have degrees
@@ -72,6 +74,7 @@ class Model:
     settings: DiagnosisSettings
     #: s^ is that of the mean of all maps, and what they have alike beside it is sky beyond lmax, of this variance, uK^2
     pooled: float = 0.0
+    careful: bool = False  # the inverse covariance is that of CAREFUL
 
     @property
     def frame(self) -> str:
@@ -117,7 +120,7 @@ class Model:
             return self
         parts = marginalised(self.survey, self.parts)
         inverse = inverse_of(self.cl, self.response, parts, offsets=True)
-        return replace(self, parts=parts, inverse=inverse, settings=_careful(self.settings))
+        return replace(self, parts=parts, inverse=inverse, careful=True)
 
     def of(self, channel: int) -> tuple[int, ...]:
         """Return the indices of the channel's maps."""
@@ -211,14 +214,9 @@ def _pooled(model: Model, unresolved: Matrix) -> Model:
         parts=tuple(parts),
         inverse=_of_mean(model.cl, response, precision),
         sky_power=snr / (1.0 + snr),
-        settings=_careful(model.settings),
         pooled=alike,
+        careful=True,
     )
-
-
-def _careful(settings: DiagnosisSettings) -> DiagnosisSettings:
-    """Return settings with which what all maps have alike, nearly all sky, is known to a tenth of the rest."""
-    return replace(settings, filter_tolerance=CAREFUL * settings.filter_tolerance)
 
 
 def _mean(rows: Matrix, parts: Sequence[Part]) -> Vector:
@@ -393,7 +391,7 @@ def _sky(model: Model, clean: Sequence[Map], careful: bool = False) -> Alm:
     if model.inverse is not None:
         maps = divided(*_summed(model, clean))[None] if model.pooled else np.stack(clean)
         weighted = model.inverse.adjoint(model.inverse.weighted(maps))
-        tolerance = settings.filter_tolerance * (0.01 if careful else 1.0)
+        tolerance = settings.filter_tolerance * (0.01 if careful else 1.0) * (CAREFUL if model.careful else 1.0)
         return model.inverse.approach(weighted, tolerance, settings.filter_iterations)
     total = np.zeros(alm_.size(lmax), dtype=np.complex128)
     gain = np.zeros(lmax + 1)

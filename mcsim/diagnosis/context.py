@@ -172,6 +172,10 @@ class DataSet(ABC, Generic[Data]):
         """Return True if responses to effects depend on what these have done to the sky that the data are of."""
         return False
 
+    def crossed(self, found: Sequence[config.Effect]) -> bool:
+        """Return True if effects respond by products with the observed sky that templates of other skies lack."""
+        return False
+
     def templates(self) -> Matrix:
         """Return the templates for these data, shape (p, K)."""
         return self.context.templates

@@ -114,6 +114,10 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         """Return True if the observed sky has to be found as effects let the channels see it."""
         return any(self.same_skies.seen(found))
 
+    def crossed(self, found: Sequence[config.Effect]) -> bool:
+        """Return True if effects leave a dipole in the only channel, whose products with the sky are the observed."""
+        return bool(self.same_skies.dipole_left(found))
+
     def templates(self) -> Matrix:
         """Return the templates; those that depend on the very sky are measured on the observed one if it departs."""
         context, t, settings = self.context, self.context.templates.copy(), self.context.settings

@@ -160,7 +160,8 @@ class Refiner:
 
         All of them if the residual does not pass without an error of the templates: far from linear responses what is
         tolerated is much, and what is there looks worse than what is like it until it is simulated. Otherwise those
-        whose response bends so much there that it may be all that they fit worse by.
+        that respond to the observed sky, and those whose response bends so much there that it may be all that they fit
+        worse by.
         """
         tolerated = one.fit.pvalue <= self.context.settings.residual_level
         cosine = cosines(self.context.null.whiten_groups(now.linear, [own.columns for own in now.candidates]))
@@ -169,11 +170,15 @@ class Refiner:
             others = tuple(other for other in one.members if other != member)
             taken = {now.candidates[other].identity for other in others}
             for index in np.flatnonzero(cosine[member] >= ALIKE).tolist():
-                if index in now.done or now.candidates[index].identity in taken:
+                candidate = now.candidates[index]
+                if index in now.done or candidate.identity in taken:
                     continue
-                if tolerated or self._may_replace(now, one, others, index):
+                if tolerated or self._is_crossed(candidate) or self._may_replace(now, one, others, index):
                     found.setdefault(index, others)
         return [(others, index) for index, others in found.items()]
+
+    def _is_crossed(self, candidate: Candidate) -> bool:
+        return self.data.crossed([candidate.table(effect) for effect in candidate.basis])
 
     def _may_replace(self, now: "_Responses", one: Explanation, others: tuple[int, ...], index: int) -> bool:
         """Return True if an effect fits worse than a set beside others by no more than its bent response may cost it.

@@ -9,6 +9,8 @@ import pytest
 from instruments import two_channels
 from mcsim import config
 from mcsim.config.noise import NoiseCorrelated
+from mcsim.datavector.analysis import analysis_of, data_vectors
+from mcsim.datavector.bipolar_scan import BipolarScan
 from mcsim.datavector.parts import LEFT
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import blocks_of
@@ -190,6 +192,24 @@ def test_the_power_of_the_sky_beyond_the_filter_is_measured(bright):
             maps = list(simulate.maps(made.without_noise, number, sky=seen))
             power[which] += vector_of(bright, maps)[fine].sum()
     assert power[1] / power[0] == pytest.approx(0.64, abs=0.05)
+
+
+def test_simulated_maps_are_filtered_as_observed_ones(bright):
+    """Settings of a model that had a tolerance of its own gave it to the jobs, which made it ten times as small."""
+    analysis = analysis_of(bright.survey.config, settings=bright.settings)
+    (simulated,) = data_vectors(replace(analysis.job(analysis.run), count=1, bipolar_scan=True))
+    maps = list(simulate.maps(analysis.model.survey, 0))
+    np.testing.assert_allclose(simulated, analysis.data_vector(maps, bipolar_scan=True), rtol=1e-9, atol=0.0)
+
+
+def test_the_only_channel_is_compared_with_the_sky_by_its_differences_alone(run):
+    """The sum of its residuals is the sky itself; what differs is how far conjugate gradients went."""
+    alone = modelled(replace(run, channels=run.channels[:1]))
+    assert alone.inverse is not None
+    compared = {(one.channels, one.split) for one in BipolarScan(alone).elements if one.kind == "biposh"}
+    assert compared == {(alone.channels, None), (alone.channels, "difference")}
+    elements = [one for one in BipolarScan(alone).elements if one.kind == "biposh" and one.split is None]
+    assert {one.name.split("/")[1] for one in elements} == {"sky"}
 
 
 def test_what_is_subtracted_may_depend_on_pixels_that_a_mask_hides(bright):
