@@ -28,13 +28,16 @@ class Controls:
 
     Notes
     -----
-    Controls of a right model have uniform p-values. They fail if the smallest of N, times N (Bonferroni), or the
-    p-value of the Kolmogorov-Smirnov test against uniformity is below ``LEVEL``: those of at most 2 % of right models.
+    Controls of a right model have p-values that are uniform over data and simulations. They fail if the smallest of N,
+    times N (Bonferroni), or the p-value of the Kolmogorov-Smirnov test against uniformity is below ``LEVEL``: those of
+    at most 2 % of right models. All p-values share the error of the model's simulations, so that the test is that of
+    two samples, controls and simulations. Rates: tests/statistical/test_control_rates.py.
     """
 
     members: tuple[Control, ...]  #: one for each control
     drawn: str  #: how they were drawn, in words
     alpha: float  #: global p-value up to which a control counts as a false alarm
+    simulations: int  #: of the model, that give the p-values
 
     @property
     def pvalues(self) -> tuple[float, ...]:
@@ -54,7 +57,9 @@ class Controls:
     @property
     def uniformity(self) -> float:
         """Return the p-value of the Kolmogorov-Smirnov test of uniform p-values."""
-        return float(stats.kstest(self.pvalues, "uniform").pvalue)
+        count = len(self.members)
+        size = max(1, round(count * self.simulations / (count + self.simulations)))
+        return float(stats.kstwo.sf(stats.kstest(self.pvalues, "uniform").statistic, size))
 
     @property
     def smallest(self) -> float:

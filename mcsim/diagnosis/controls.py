@@ -206,7 +206,7 @@ def diagnose_controls(known: DiagnosisContext, key: str, count: int, call: Batch
         for index, _ in call(draw, ((*fixed, number, str(_maps(folder, number))) for number in absent)):
             finish(absent[index])
     members = tuple(verdicts[number] for number in range(count))
-    return Controls(members, drawn.words, known.settings.alpha)
+    return Controls(members, drawn.words, known.settings.alpha, known.null.n_sims)
 
 
 def _maps(folder: Path, number: int) -> Path:

@@ -185,7 +185,7 @@ def test_a_file_that_has_changed_is_read_again(tmp_path):
 
 def test_controls_fail_by_one_p_value_or_by_all():
     def of(*pvalues):
-        return Controls(tuple(Control(p, "none", ()) for p in pvalues), "x", 0.05)
+        return Controls(tuple(Control(p, "none", ()) for p in pvalues), "x", 0.05, 1000)
 
     even = np.linspace(0.05, 0.95, 10)
     assert not of(*even).failed

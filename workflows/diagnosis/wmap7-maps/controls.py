@@ -39,13 +39,14 @@ def main() -> None:
         x = analysis.data_vector(list(simulate.maps(shared.at(number), number)))
         p = global_test(known.null, x, known.always, known.calibration).pvalue
         found.append(Control(p, "none" if p > known.settings.alpha else "unknown", ()))
-    print(Controls(tuple(found), drawn.words, known.settings.alpha).counted)
+    known_by = drawn.words, known.settings.alpha, known.null.n_sims
+    print(Controls(tuple(found), *known_by).counted)
     pvalues = np.array([one.pvalue for one in found])
     for level in (0.1, 0.05, 0.01, 0.005, 0.001):
         low, high = stats.binom.interval(0.95, chosen.count, level)
         print(f"p <= {level:g}: {int(np.sum(pvalues <= level))}; 95 % interval of uniform ones {low:.0f} to {high:.0f}")
     starts = range(0, chosen.count - chosen.set + 1, chosen.set)
-    sets = [Controls(tuple(found[k : k + chosen.set]), drawn.words, known.settings.alpha) for k in starts]
+    sets = [Controls(tuple(found[k : k + chosen.set]), *known_by) for k in starts]
     print(f"{sum(one.failed for one in sets)} of {len(sets)} sets of {chosen.set} controls fail")
 
 

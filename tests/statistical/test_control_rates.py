@@ -1,0 +1,36 @@
+"""Controls of right models fail at their rate, however many there are."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mcsim.diagnosis.control_result import LEVEL, Control, Controls
+from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.stats.look_elsewhere import calibrate, calibrate_in_folds, global_test
+
+MODELS, ELEMENTS, SIMULATIONS = 40, 60, 200
+
+
+@pytest.fixture(scope="module")
+def pvalues():
+    """Return p-values of 1000 perfect data of each of some models, each known from simulations of its own."""
+    rng, rows = np.random.default_rng(20261127), []
+    for _ in range(MODELS):
+        null = SimulatedGaussian.from_simulations(rng.normal(size=(SIMULATIONS, ELEMENTS)), shrink=True)
+        templates = null.whiten_groups(rng.normal(size=(ELEMENTS, 12)), [(2 * i, 2 * i + 1) for i in range(6)])
+        calibration = calibrate_in_folds(calibrate(null, templates, draws=4000), null, templates)
+        data = rng.normal(size=(1000, ELEMENTS))
+        rows.append([global_test(null, x, templates, calibration).pvalue for x in data])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("count", [30, 300, 1000])
+def test_controls_of_right_models_seldom_fail(pvalues, count):
+    controls = [Controls(tuple(Control(p, "none", ()) for p in row), "x", 0.05, SIMULATIONS) for row in pvalues]
+    failed = sum(Controls(one.members[:count], "x", 0.05, SIMULATIONS).failed for one in controls)
+    assert failed <= stats.binom.ppf(0.999, MODELS, 2.0 * LEVEL)
+
+
+def test_controls_with_too_many_small_p_values_fail():
+    wrong = np.random.default_rng(1).uniform(size=1000) ** 1.5  # 13.6 % of them are below 0.05
+    assert Controls(tuple(Control(p, "none", ()) for p in wrong), "x", 0.05, SIMULATIONS).uniformity < LEVEL
