@@ -6,32 +6,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy import special
 
-from mcsim.datavector.candidate import Candidate, columns_of, coordinates_of, effects_at, lost, parts_of, scatters_of
+from mcsim.datavector.candidate import Candidate, columns_of, parts_of, scatters_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
+from mcsim.diagnosis.partial import Detector, PartialExplanation, beyond, has_settled, skies
 from mcsim.diagnosis.selection import Attribution, Explanation, Selection, attributed
 from mcsim.errors import InputError
 from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit
-from mcsim.stats.scattered import Acting, with_drawn_scatter
+from mcsim.stats.scattered import Acting
 from mcsim.support.arrays import Matrix, Vector
 
 ALIKE = 0.7  #: cosine of linear responses from which on one candidate can pass for another
 NEARLY = 0.8  #: share of what the best single candidate explains, from which on others are tried that explain less
-
-
-@dataclass(frozen=True)
-class PartialExplanation:
-    """Hold effects that are detected without explaining all of the excess chi^2.
-
-    ``members`` are the indices of the candidates, in the order in which they were detected, and ``fit`` the amplitudes
-    of their columns; ``left`` is the share of the excess chi^2 that they leave. The ``templates``, shape (p, K), hold
-    for the members together.
-    """
-
-    members: tuple[int, ...]
-    fit: Fit
-    left: float
-    templates: Matrix
 
 
 @dataclass(frozen=True)
@@ -104,7 +90,7 @@ class Refiner:
             if (index,) in [one.members for one in own.explanations]:
                 now, found = alone, own
                 break
-        detected = self.detected_in(now.t, now.candidates) if found.verdict == "unknown" else None
+        detected = Detector(self.data).run(now.t, now.candidates) if found.verdict == "unknown" else None
         if detected is not None and len(detected.members) <= self.context.settings.max_effects:
             done = {member: now.done.get(member) for member in detected.members}
             beside = _Responses(now.linear, detected.templates.copy(), [*now.candidates], done)
@@ -215,7 +201,7 @@ class Refiner:
         candidate = now.candidates[index]
         columns, how, done = list(candidate.columns), candidate.parametrization, now.done.get(index)
         within = candidate.nuisance and not self._is_beyond_prior(now.linear[:, columns], len(now.candidates))
-        if within or self._has_settled(done, coordinates, covariance):
+        if within or has_settled(self.context.settings, done, coordinates, covariance):
             return False
         nonlinear = curved or how.nonlinear or candidate.nuisance or self._is_nonlinear(columns, coordinates)
         # From here on its template is what it does to this very sky, and its prior a part of its error.
@@ -233,7 +219,7 @@ class Refiner:
         at, changes, pair = answer
         there = candidate.table(candidate.with_coordinates(at, np.eye(len(at))))
         if nonlinear or self.data.rescaled([there]):
-            now.t[:, columns] += self._beyond(now.t[:, columns], at, changes.mean(axis=0))
+            now.t[:, columns] += beyond(self.context.null, now.t[:, columns], at, changes.mean(axis=0))
         if stochastic:
             now.candidates[index] = replace(candidate, scatter=self.data.scatter(changes), shape_error=None)
         elif pair is not None:
@@ -252,7 +238,7 @@ class Refiner:
             for index, done in now.done.items()
             if now.candidates[index].scatter is None
             and (alone := found.singles[index]).delta_chi2 < first.singles[index].delta_chi2
-            and not self._has_settled(done, alone.amplitudes, alone.covariance)
+            and not has_settled(self.context.settings, done, alone.amplitudes, alone.covariance)
         ]
 
     def _alone(self, now: "_Responses", linear: Matrix, index: int) -> "_Responses":
@@ -269,52 +255,6 @@ class Refiner:
                 break
         return now
 
-    def detected_in(self, t: Matrix, candidates: Sequence[Candidate]) -> PartialExplanation | None:
-        """Add the most significant candidate beside those that are detected already, until none is significant.
-
-        None if nothing is. Each is significant beside those before it, before and after it is simulated together with
-        them at its amplitude; of two similar effects the one that is not there may be the first.
-        """
-        null, settings = self.context.null, self.context.settings
-        members: tuple[int, ...] = ()
-        refused: set[int] = set()
-        while len(members) < settings.partial_effects and len(refused) < settings.partial_refusals:
-            pvalues = self._beside(t, candidates, members)
-            best = next((int(i) for i in np.argsort(pvalues) if i not in refused), -1)
-            if best < 0 or pvalues[best] > settings.partial_level:
-                break
-            together = (*members, best)
-            exact = self._together(candidates, t, together)
-            if exact is not None and self._beside(exact, candidates, members)[best] <= settings.partial_level:
-                members, t = together, exact
-            else:
-                refused.add(best)
-        if not members:
-            return None
-        fit = null.fit(self.data.x, t[:, columns_of(candidates, members)])
-        excess = null.hartlap_factor * null.chi2(self.data.x) - null.dimension
-        left = null.hartlap_factor * fit.chi2 - fit.dimension
-        if scatters := scatters_of(candidates, members):
-            own = t[:, columns_of(candidates, members)]
-            wide = null.with_extra_covariance(*scatters).fit(self.data.x, own)
-            fit = with_drawn_scatter(null, own, wide, scatters)
-        return PartialExplanation(members, fit, min(max(left / excess, 0.0), 1.0) if excess > 0.0 else 1.0, t)
-
-    def _beside(self, t: Matrix, candidates: Sequence[Candidate], members: tuple[int, ...]) -> Vector:
-        """Return the global p-value of each candidate beside members, which scatter the data as in an attribution.
-
-        A candidate counts for what its nearest possible amplitude explains, and not at all if it, or with it a member,
-        is impossible.
-        """
-        known = self.context
-        search = Selection(known.null, self.data.x, t, candidates, known.calibration, known.settings).search(members)
-        row, less = np.array([members], dtype=np.int64), np.zeros(len(candidates))
-        for new in np.flatnonzero(search.beside(row)[0] <= known.settings.partial_level):
-            together = (*members, int(new))
-            fit = search.null.fit(self.data.x, t[:, columns_of(candidates, together)])
-            less[new] = lost(candidates, together, fit, search.null.dof)
-        return search.beside(row, less)[0]
-
     def _attribute(self, t: Matrix, candidates: Sequence[Candidate]) -> Attribution:
         return attributed(self._selection(t, candidates), self.data.gap)
 
@@ -322,48 +262,10 @@ class Refiner:
         known = self.context
         return Selection(known.null, self.data.x, t, candidates, known.calibration, known.settings)
 
-    def _together(self, candidates: Sequence[Candidate], t: Matrix, members: tuple[int, ...]) -> Matrix | None:
-        """Return templates that are exact for effects that act together, at about their fitted amplitudes.
-
-        Strong effects change their own responses and each other's. None if one can have no such amplitude, or the
-        amplitudes diverge round by round.
-        """
-        columns, share = np.array(columns_of(candidates, members)), self.context.settings.settled_share
-        fitted = self.context.null.fit(self.data.x, t[:, columns])
-        for _ in range(self.context.settings.joint_rounds):
-            try:
-                effects = effects_at(candidates, members, fitted)
-                tables = [candidates[member].table(effect) for member, effect in zip(members, effects, strict=True)]
-                stochastic = any(effect.parametrization.stochastic for effect in effects)
-                response = self.data.respond(tables, self._skies(stochastic)).mean(axis=0)
-            except InputError:
-                return None
-            t = t.copy()
-            at = coordinates_of(candidates, members, effects)
-            t[:, columns] += self._beyond(t[:, columns], at, response)
-            before, fitted = fitted, self.context.null.fit(self.data.x, t[:, columns])
-            if self._has_settled(before.amplitudes, fitted.amplitudes, fitted.covariance, share):
-                return t
-        return None
-
     def _squared(self, linear: Matrix, t: Matrix, at: Vector) -> float:
         """Return the share of the response of templates at coordinates that is not in the linear ones, 0 to 1."""
         first, whole = self.context.null.whiten_templates(np.stack([linear @ at, t @ at], axis=1)).T
         return float(np.clip(1.0 - first @ whole / max(float(whole @ whole), 1e-300), 0.0, 1.0))
-
-    def _skies(self, stochastic: bool) -> int:
-        return self.context.settings.scatter_skies if stochastic else self.context.settings.constrained_skies
-
-    def _beyond(self, t: Matrix, at: Vector, response: Vector) -> Matrix:
-        """Return what makes templates, shape (p, k), exact at coordinates: the response beyond their sum.
-
-        It is shared in proportion to the squared white norms of the parts, so that a weakly constrained one, whatever
-        its fitted coordinate, does not change.
-        """
-        parts = t * at
-        weights = np.sum(self.context.null.whiten_templates(parts) ** 2, axis=0)
-        shares = np.divide(weights, at * weights.sum(), out=np.zeros_like(at), where=weights > 0.0)
-        return np.outer(response - parts.sum(axis=1), shares)
 
     def _simulated(
         self, candidate: Candidate, coordinates: Vector, covariance: Matrix, stochastic: bool
@@ -378,7 +280,11 @@ class Refiner:
                 effect = candidate.detected(factor * coordinates, factor**2 * covariance)
                 tables = [candidate.table(effect)]
                 pair = None if stochastic else self.data.pair(tables)
-                changes = self.data.respond(tables, self._skies(stochastic)) if pair is None else pair[1] - pair[0]
+                changes = (
+                    self.data.respond(tables, skies(self.context.settings, stochastic))
+                    if pair is None
+                    else pair[1] - pair[0]
+                )
                 return candidate.parametrization.coordinates(effect), changes, pair
             except InputError:
                 continue
@@ -438,14 +344,6 @@ class Refiner:
         shift = self.context.bank.curvature[:, columns] @ coordinates**2
         crossed = float(np.sum(np.abs(coordinates)) ** 2) / max(float(coordinates @ coordinates), 1e-300)
         return crossed * float(np.linalg.norm(self.context.null.whiten_templates(shift[:, None])))
-
-    def _has_settled(self, before: Vector | None, now: Vector, covariance: Matrix, share: float = 0.0) -> bool:
-        """Return True if amplitudes have hardly moved, by their errors, or by a share of their size."""
-        if before is None:
-            return False
-        precision = np.linalg.pinv(covariance)
-        moved, size = (float(v @ precision @ v) for v in (now - before, now))
-        return moved < max(self.context.settings.settled_sigma**2, share**2 * size)
 
 
 def _size(found: Attribution) -> int:

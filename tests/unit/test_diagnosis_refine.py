@@ -8,6 +8,7 @@ import pytest
 
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.diagnosis.partial import Detector
 from mcsim.diagnosis.refine import Refiner
 from mcsim.diagnosis.selection import attribute
 from mcsim.errors import InputError
@@ -45,7 +46,7 @@ class Instrument:
     """Three effects on evidence of unit normals, with a response that is no straight line."""
 
     def __init__(self, bend: float, cross: float, noise: float | None = None) -> None:
-        self.noise = noise
+        self.noise, self.crossed = noise, ""
         rng = np.random.default_rng(21)
         directions = np.linalg.qr(rng.normal(size=(P, 5)))[0].T
         self.t, self.sideways = directions[:3].T, directions[3:]
@@ -79,6 +80,7 @@ class Instrument:
         bank = SimpleNamespace(curvature=self.curvature)
         context = SimpleNamespace(null=self.null, calibration=self.calibration, bank=bank, settings=self.settings)
         own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter, "rescaled": lambda tables: False}
+        own["crossed"] = lambda tables: tables[0].channel in self.crossed
         groups = self.null.whiten_groups(self.t, [one.columns for one in self.candidates])
         gap = global_test(self.null, x, groups, self.calibration)
         data = SimpleNamespace(context=context, x=x, realizations=1, gap=gap, **own)
@@ -128,6 +130,19 @@ def test_what_is_like_a_name_is_simulated_where_its_response_bends(beside, membe
     found = instrument.refined(x).attribution
     assert {one.members for one in found.explanations} == members
     assert any("A" in tables for tables in instrument.analysis) == ((0,) in members)
+
+
+@pytest.mark.parametrize(("crossed", "members"), [("A", {(0,), (2,)}), ("B", {(2,)})])
+def test_what_is_like_a_name_is_simulated_where_it_responds_to_the_observed_sky(crossed, members):
+    """C has the response of A in this sky, of which no curvature knows."""
+    instrument = Instrument(bend=0.04, cross=0.0)
+    instrument.curvature = np.zeros_like(instrument.curvature)
+    instrument.crossed = crossed
+    x = instrument.response(15.0, 0.0)
+    instrument.t[:, 2] = x / np.linalg.norm(x)
+    found = instrument.refined(x).attribution
+    assert {one.members for one in found.explanations} == members
+    assert any("A" in tables for tables in instrument.analysis) == (crossed == "A")
 
 
 def test_what_is_like_a_member_is_simulated_where_a_set_suffices_by_tolerance_alone():
@@ -201,10 +216,10 @@ def test_effects_that_change_each_other_are_simulated_together():
     ("cross", "last"), [(0.0, {"B"}), (0.06, {"C"})], ids=["at the end", "beside what is detected"]
 )
 def test_no_set_is_named_before_each_member_is_simulated(monkeypatch, cross, last):
-    instrument, detected_in = Instrument(bend=0.0, cross=cross), Refiner.detected_in
+    instrument, run = Instrument(bend=0.0, cross=cross), Detector.run
     x = instrument.response(12.0, 14.0) + (8.0 * instrument.t[:, 2] if cross else 0.0)
     monkeypatch.setattr(Refiner, "_to_try", lambda *_: [])
-    monkeypatch.setattr(Refiner, "detected_in", lambda *own: replace(detected_in(*own), members=(0, 1)))
+    monkeypatch.setattr(Detector, "run", lambda *own: replace(run(*own), members=(0, 1)))
     found = instrument.refined(x).attribution
     assert found.explanations[0].members == ((0, 1, 2) if cross else (0, 1))
     assert instrument.analysis[-1].keys() == last

@@ -1,0 +1,141 @@
+"""Find what is detected of a gap that no set of candidates explains, and refine what acts together."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mcsim.datavector.candidate import Candidate, columns_of, coordinates_of, effects_at, lost, scatters_of
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.diagnosis.context import DataSet, DiagnosisContext
+from mcsim.diagnosis.selection import Selection
+from mcsim.errors import InputError
+from mcsim.stats.gaussian import Fit, SimulatedGaussian
+from mcsim.stats.scattered import with_drawn_scatter
+from mcsim.support.arrays import Matrix, Vector
+
+
+@dataclass(frozen=True)
+class PartialExplanation:
+    """Hold effects that are detected without explaining all of the excess chi^2.
+
+    ``members`` are the indices of the candidates, in the order in which they were detected, and ``fit`` the amplitudes
+    of their columns; ``left`` is the share of the excess chi^2 that they leave. The ``templates``, shape (p, K), hold
+    for the members together.
+    """
+
+    members: tuple[int, ...]
+    fit: Fit
+    left: float
+    templates: Matrix
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Add candidates to those that are detected in data, one by one."""
+
+    data: DataSet[Any]
+
+    @property
+    def context(self) -> DiagnosisContext:
+        """Return the model, its simulations and templates."""
+        return self.data.context
+
+    def run(self, t: Matrix, candidates: Sequence[Candidate]) -> PartialExplanation | None:
+        """Add the most significant candidate beside those that are detected already, until none is significant.
+
+        None if nothing is. Each is significant beside those before it, before and after it is simulated together with
+        them at its amplitude; of two similar effects the one that is not there may be the first.
+        """
+        null, settings = self.context.null, self.context.settings
+        members: tuple[int, ...] = ()
+        refused: set[int] = set()
+        while len(members) < settings.partial_effects and len(refused) < settings.partial_refusals:
+            pvalues = self._beside(t, candidates, members)
+            best = next((int(i) for i in np.argsort(pvalues) if i not in refused), -1)
+            if best < 0 or pvalues[best] > settings.partial_level:
+                break
+            together = (*members, best)
+            exact = self._together(candidates, t, together)
+            if exact is not None and self._beside(exact, candidates, members)[best] <= settings.partial_level:
+                members, t = together, exact
+            else:
+                refused.add(best)
+        if not members:
+            return None
+        fit = null.fit(self.data.x, t[:, columns_of(candidates, members)])
+        excess = null.hartlap_factor * null.chi2(self.data.x) - null.dimension
+        left = null.hartlap_factor * fit.chi2 - fit.dimension
+        if scatters := scatters_of(candidates, members):
+            own = t[:, columns_of(candidates, members)]
+            wide = null.with_extra_covariance(*scatters).fit(self.data.x, own)
+            fit = with_drawn_scatter(null, own, wide, scatters)
+        return PartialExplanation(members, fit, min(max(left / excess, 0.0), 1.0) if excess > 0.0 else 1.0, t)
+
+    def _beside(self, t: Matrix, candidates: Sequence[Candidate], members: tuple[int, ...]) -> Vector:
+        """Return the global p-value of each candidate beside members, which scatter the data as in an attribution.
+
+        A candidate counts for what its nearest possible amplitude explains, and not at all if it, or with it a member,
+        is impossible.
+        """
+        known = self.context
+        search = Selection(known.null, self.data.x, t, candidates, known.calibration, known.settings).search(members)
+        row, less = np.array([members], dtype=np.int64), np.zeros(len(candidates))
+        for new in np.flatnonzero(search.beside(row)[0] <= known.settings.partial_level):
+            together = (*members, int(new))
+            fit = search.null.fit(self.data.x, t[:, columns_of(candidates, together)])
+            less[new] = lost(candidates, together, fit, search.null.dof)
+        return search.beside(row, less)[0]
+
+    def _together(self, candidates: Sequence[Candidate], t: Matrix, members: tuple[int, ...]) -> Matrix | None:
+        """Return templates that are exact for effects that act together, at about their fitted amplitudes.
+
+        Strong effects change their own responses and each other's. None if one can have no such amplitude, or the
+        amplitudes diverge round by round.
+        """
+        columns, share = np.array(columns_of(candidates, members)), self.context.settings.settled_share
+        fitted = self.context.null.fit(self.data.x, t[:, columns])
+        for _ in range(self.context.settings.joint_rounds):
+            try:
+                effects = effects_at(candidates, members, fitted)
+                tables = [candidates[member].table(effect) for member, effect in zip(members, effects, strict=True)]
+                stochastic = any(effect.parametrization.stochastic for effect in effects)
+                response = self.data.respond(tables, skies(self.context.settings, stochastic)).mean(axis=0)
+            except InputError:
+                return None
+            t = t.copy()
+            at = coordinates_of(candidates, members, effects)
+            t[:, columns] += beyond(self.context.null, t[:, columns], at, response)
+            before, fitted = fitted, self.context.null.fit(self.data.x, t[:, columns])
+            if has_settled(self.context.settings, before.amplitudes, fitted.amplitudes, fitted.covariance, share):
+                return t
+        return None
+
+
+def skies(settings: DiagnosisSettings, stochastic: bool) -> int:
+    """Return how many constrained skies the response to effects is averaged over."""
+    return settings.scatter_skies if stochastic else settings.constrained_skies
+
+
+def beyond(null: SimulatedGaussian, t: Matrix, at: Vector, response: Vector) -> Matrix:
+    """Return what makes templates, shape (p, k), exact at coordinates: the response beyond their sum.
+
+    It is shared in proportion to the squared white norms of the parts, so that a weakly constrained one, whatever
+    its fitted coordinate, does not change.
+    """
+    parts = t * at
+    weights = np.sum(null.whiten_templates(parts) ** 2, axis=0)
+    shares = np.divide(weights, at * weights.sum(), out=np.zeros_like(at), where=weights > 0.0)
+    return np.outer(response - parts.sum(axis=1), shares)
+
+
+def has_settled(
+    settings: DiagnosisSettings, before: Vector | None, now: Vector, covariance: Matrix, share: float = 0.0
+) -> bool:
+    """Return True if amplitudes have hardly moved, by their errors, or by a share of their size."""
+    if before is None:
+        return False
+    precision = np.linalg.pinv(covariance)
+    moved, size = (float(v @ precision @ v) for v in (now - before, now))
+    return moved < max(settings.settled_sigma**2, share**2 * size)
