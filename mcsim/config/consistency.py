@@ -4,6 +4,7 @@ import math
 import warnings
 from typing import Any
 
+from mcsim.config import preparation
 from mcsim.config.noise import in_words, is_noise_free
 
 NARROWEST = 0.03  #: width of a beam, radians, times lmax: a Gaussian of it has B_l > 0.9999 up to lmax
@@ -66,9 +67,11 @@ def check_filter(run: Any) -> None:
         if run.biposh.probes is not None:
             raise ValueError('biposh.probes is given without a filter; remove it or set filter = "inverse_covariance"')
         return
+    # What is fitted and subtracted has any amplitude for the filter, and masked pixels have no weight.
+    changing = next((one.kind for one in run.preparation if not preparation.keeps_pixels(one)), "")
     for key, given in (
         ('map.grid = "gl"', run.map.grid == "gl"),
-        ("[[preparation]]", bool(run.preparation)),
+        (f'[[preparation]] kind = "{changing}"', bool(changing)),
         ('biposh.weighting = "hits"', run.biposh.weighting == "hits"),
         (f"biposh.iterations = {run.biposh.iterations}", run.biposh.iterations > 0),
         ("sky without spectrum", run.sky.spectrum is None),

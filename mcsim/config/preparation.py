@@ -134,6 +134,11 @@ Step = Annotated[Degrade | Smooth | SubtractDipole | Templates | Fill | Mask | R
 STEPS = (Degrade, Smooth, SubtractDipole, Templates, Fill, Mask, Rotate)
 
 
+def keeps_pixels(step: Step) -> bool:
+    """Return True for a step that masks, or fits and subtracts; the rest of a map and its noise stay."""
+    return isinstance(step, SubtractDipole | Mask) or (isinstance(step, Templates) and step.coefficients is None)
+
+
 def grid_after(steps: Sequence[Step], nside: int, frame: str) -> tuple[int, str]:
     """Return nside and frame of maps after the steps."""
     for step in steps:

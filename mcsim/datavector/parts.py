@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mcsim.instrument.scan import Moments
 from mcsim.simulation.inverse_covariance import covariance_of_amplitudes
+from mcsim.simulation.preparation import templates_of
 from mcsim.simulation.survey import Survey
 from mcsim.support.arrays import Map, Matrix
 
@@ -54,34 +55,6 @@ class Part:
         return [(columns, weight, covariance_of_amplitudes(columns, weight)) for columns, weight in each]
 
 
-def keeps_pixels(survey: Survey) -> bool:
-    """Return True if no map is prepared but by fits that are subtracted and by masks: its pixels and noise stay."""
-    maps = [m for channel in survey.channels for m in channel.maps]
-    return all(m.preparation is None or m.preparation.subtracts for m in maps)
-
-
-def regressions(survey: Survey) -> list[list[tuple[NDArray[np.float64], Map]]]:
-    """Return what is fitted and subtracted from every map, with which weights; what is the same is kept once."""
-    known, found = list[tuple[NDArray[np.float64], Map]](), []
-    for m in (m for channel in survey.channels for m in channel.maps):
-        own = []
-        for one in () if m.preparation is None else m.preparation.regressions():
-            same = (other for other in known if all(map(np.array_equal, one, other)))
-            own.append(next(same, one))
-            known.append(own[-1])
-        found.append(own)
-    return found
-
-
-def templates_of(survey: Survey) -> list[NDArray[np.float64] | None]:
-    """Return all that is fitted and subtracted from every map, shape (K, npix); None: nothing."""
-    found: list[NDArray[np.float64] | None] = []
-    for columns in ([one for one, _ in own] for own in regressions(survey)):
-        # One alone is the same array in all maps that have it.
-        found.append(np.concatenate(columns) if len(columns) > 1 else next(iter(columns), None))
-    return found
-
-
 def marginalised(survey: Survey, parts: Sequence[Part]) -> tuple[Part, ...]:
     """Return parts of maps that know nothing of what was subtracted from them.
 
@@ -89,5 +62,5 @@ def marginalised(survey: Survey, parts: Sequence[Part]) -> tuple[Part, ...]:
     """
     return tuple(
         replace(part, subtracted=() if own is None else ((own, part.precision),), left=TRACE)
-        for part, own in zip(parts, templates_of(survey), strict=True)
+        for part, own in zip(parts, templates_of(survey.preparations), strict=True)
     )

@@ -27,12 +27,13 @@ from numpy.typing import NDArray
 
 from mcsim.bipolar import by_degree
 from mcsim.datavector import pixel_noise
-from mcsim.datavector.parts import Part, keeps_pixels, marginalised, regressions
+from mcsim.datavector.parts import Part, marginalised
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.simulation import convolve
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
 from mcsim.simulation.noise import NoiseOfFiles
+from mcsim.simulation.preparation import keeps_pixels, regressions
 from mcsim.simulation.survey import Channel, Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
@@ -204,7 +205,7 @@ def _pooled(model: Model, unresolved: Matrix) -> Model:
     own, alike = [_variance(one - shared) for one in unresolved], _variance(shared)
     parts = [
         replace(part, precision=part.precision / (1.0 + own[part.channel] * part.precision), subtracted=tuple(one))
-        for part, one in zip(model.parts, regressions(model.survey), strict=True)
+        for part, one in zip(model.parts, regressions(model.survey.preparations), strict=True)
     ]
     total = np.sum([part.precision for part in parts], axis=0)
     response, precision = _mean(model.response, model.parts), total / (1.0 + alike * total)
@@ -254,7 +255,7 @@ def _highest_degree(survey: Survey, snr: Cl) -> int:
     prepared maps, whose noise is not white and whose pixels may be degraded.
     """
     last = min(snr.size - 1, 5 * survey.nside // 2)
-    if not keeps_pixels(survey) or np.any(snr[last + 1 :] > 1.0):
+    if not keeps_pixels(survey.preparations) or np.any(snr[last + 1 :] > 1.0):
         return survey.lmax
     return max(survey.lmax, int(np.flatnonzero(snr[: last + 1] >= FAINT).max(initial=0)))
 

@@ -12,7 +12,6 @@ import numpy as np
 from mcsim import config, systematics
 from mcsim.datavector.analysis import Analysis, analysis_of, check_asked
 from mcsim.datavector.candidate import Candidate, numbered
-from mcsim.datavector.parts import keeps_pixels, templates_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.information import figure
@@ -26,6 +25,7 @@ from mcsim.simulation.channels import refuse_external
 from mcsim.simulation.filtering import unknown_dipole
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
 from mcsim.simulation.nuisance import nuisances_of
+from mcsim.simulation.preparation import keeps_pixels, templates_of
 from mcsim.simulation.survey import survey
 from mcsim.support import folders, page
 from mcsim.support.arrays import divided
@@ -187,14 +187,14 @@ def inverse_covariance(
     """
     shared = analysis.model.survey
     prepared = survey(run, nthreads=nthreads, library=dict(analysis.library)) if run.preparation else shared
-    if not keeps_pixels(prepared):
+    if not keeps_pixels(prepared.preparations):
         raise InputError(
             "the limit is that of white noise in the pixels of maps, which [[preparation]] changes; leave out its "
             "steps but for templates and dipoles that are fitted and subtracted, and masks of zeros and ones."
         )
     made = [(channel, m) for channel in shared.channels for m in channel.maps]
     maps = []
-    for (channel, m), analysed, templates in zip(made, prepared.maps, templates_of(prepared), strict=True):
+    for (channel, m), analysed, templates in zip(made, prepared.maps, templates_of(prepared.preparations), strict=True):
         if channel.side_b is not None:
             raise InputError(
                 f"channel {channel.name} reads differences of two beams, whose maps have noise that is not white; "

@@ -73,8 +73,8 @@ class MapFilter:
 
     @property
     def uniform(self) -> bool:
-        """Return True if all pixels have the same noise: the filter is then diagonal."""
-        return bool(np.all(self._precision == self._precision[0]))
+        """Return True if all pixels have the same noise, and nothing was fitted: the filter is then diagonal."""
+        return self.inverse.maps[0].templates is None and bool(np.all(self._precision == self._precision[0]))
 
     def noise(self, power: Map) -> Vector:
         """Return the mean C_l of noise in what the filter measures, uK^2, shape (lmax of the sky + 1,).
@@ -101,7 +101,7 @@ class MapFilter:
             return found, alm_.resize(sky, self.lmax, self.inverse.lmax)
         observed = np.where(self._precision > 0.0, map_uk, 0.0)[None]
         inverse = self.inverse
-        sky = inverse.solve(inverse.adjoint(inverse.precision * observed), near)
+        sky = inverse.solve(inverse.adjoint(inverse.weighted(observed)), near)
         found = healpix.adjoint(inverse.apply(observed, sky)[0], inverse.lmax, inverse.nthreads)
         found = alm_.multiply(found, window, inverse.lmax)
         # Where the sky is far above the noise the difference of the two loses digits; s^ = S B x does not.
@@ -440,7 +440,8 @@ class Filtering:
         found = hashlib.sha256(text.encode())
         for each in self.filters:
             observed = each.inverse.maps[0]
-            for array in (each.inverse.cl, observed.precision, observed.response.factors, each.window):
+            fitted = () if observed.templates is None else (observed.templates,)
+            for array in (each.inverse.cl, observed.precision, observed.response.factors, each.window, *fitted):
                 found.update(np.ascontiguousarray(array).tobytes())
             found.update(f"{each.name} {each.inverse.tolerance} {each.lmax}".encode())
         return found.hexdigest()[:32]

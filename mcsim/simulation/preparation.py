@@ -4,6 +4,7 @@ Inside, a map is NaN where it was not observed. Each step changes a map and says
 of white noise, and of what belongs to the samples of a pixel (hits, orientation moments).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -166,6 +167,33 @@ class Preparation:
         That is exact where orientations change slowly over the target beam.
         """
         return replace(beam, blm=beam.blm * self.beam_window(beam.lmax))
+
+
+def keeps_pixels(preparations: Sequence[Preparation | None]) -> bool:
+    """Return True if no map is prepared but by fits that are subtracted and by masks: its pixels and noise stay."""
+    return all(one is None or one.subtracts for one in preparations)
+
+
+def regressions(preparations: Sequence[Preparation | None]) -> list[list[tuple[NDArray[np.float64], Map]]]:
+    """Return what is fitted and subtracted from every map, with which weights; what is the same is kept once."""
+    known, found = list[tuple[NDArray[np.float64], Map]](), []
+    for preparation in preparations:
+        own = []
+        for one in () if preparation is None else preparation.regressions():
+            same = (other for other in known if all(map(np.array_equal, one, other)))
+            own.append(next(same, one))
+            known.append(own[-1])
+        found.append(own)
+    return found
+
+
+def templates_of(preparations: Sequence[Preparation | None]) -> list[NDArray[np.float64] | None]:
+    """Return all that is fitted and subtracted from every map, shape (K, npix); None: nothing."""
+    found: list[NDArray[np.float64] | None] = []
+    for columns in ([one for one, _ in own] for own in regressions(preparations)):
+        # One alone is the same array in all maps that have it.
+        found.append(np.concatenate(columns) if len(columns) > 1 else next(iter(columns), None))
+    return found
 
 
 def preparation(

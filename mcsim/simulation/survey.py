@@ -165,6 +165,11 @@ class Survey:
         return tuple(m for channel in self.channels for m in channel.maps)
 
     @property
+    def preparations(self) -> tuple[Preparation | None, ...]:
+        """What is done to each map after it is made."""
+        return tuple(m.preparation for m in self.maps)
+
+    @property
     def map_names(self) -> tuple[str, ...]:
         """Names of the maps, in order."""
         return tuple(m.name for m in self.maps)
@@ -205,7 +210,7 @@ def survey(
     pairs = tuple((x, y) for x in range(size) for y in range(x, size) if both or x == y)
     norm = tuple(1.0 / _overlap(maps[x], maps[y]) for x, y in pairs)
     tables = estimator(run.biposh.L_max, config.analysis_lmax(run), both_orders=both and size > 1)
-    filters = filtering_of(run, made, cl, (pairs, tables), nthreads)
+    filters = filtering_of(run, (made, channels), cl, (pairs, tables), nthreads)
     found = Survey(run, cl, made, config.analysis_lmax(run), tables, pairs, norm, None, filters)
     return replace(found, channels=channels, source=found) if run.preparation else found
 

@@ -23,14 +23,18 @@ TABLES = estimator(2, LMAX, both_orders=True)
 UNITS = [sky for _, sky in unit_skies(LMAX)]
 
 
-def map_filter(seed: int, tolerance: float = 1e-6) -> MapFilter:
+CENTRES = np.array(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2)))
+FITTED = np.stack([np.ones(12 * NSIDE**2), *CENTRES, CENTRES[0] * CENTRES[2] ** 3])  # dipole and a foreground
+
+
+def map_filter(seed: int, tolerance: float = 1e-6, templates: np.ndarray | None = None) -> MapFilter:
     """One map with a mask, uneven noise and a pixel window."""
     rng = np.random.default_rng(seed)
     latitude = np.rad2deg(np.arcsin(healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[2]))
     precision = rng.uniform(0.2, 5.0, latitude.size) * (np.abs(latitude - 10.0 * seed) > 12.0) / 30.0**2
     window = healpix.pixel_window(NSIDE, LMAX)
     response = convolve.response(Beam.gaussian(900.0, LMAX), LMAX, window)
-    inverse = InverseCovariance(CL, [ObservedMap(response, precision)], tolerance)
+    inverse = InverseCovariance(CL, [ObservedMap(response, precision, templates=templates)], tolerance)
     return MapFilter(f"map{seed}", inverse, window, LMAX)
 
 
@@ -44,6 +48,10 @@ def filtered_covariance(one: MapFilter) -> tuple[np.ndarray, np.ndarray]:
     covariance = (sky * CL[degrees]) @ sky.T + np.diag(1.0 / precision[seen])
     operator = np.zeros((len(UNITS), precision.size))
     operator[:, seen] = np.linalg.solve(covariance, pixels[seen]).T
+    if (fitted := one.inverse.maps[0].templates) is not None:
+        known = np.linalg.solve(covariance, fitted[:, seen].T)
+        size = np.linalg.inv(fitted[:, seen] @ known)
+        operator[:, seen] -= operator[:, seen] @ fitted[:, seen].T @ size @ known.T
     return operator @ pixels, operator
 
 
@@ -84,6 +92,33 @@ def test_filter_equals_a_dense_solve(filters) -> None:
         assert np.abs(packed(tried.apply(data)[0]) - expected).max() < error * np.abs(expected).max()
     again, _ = one.apply(data, near=one.apply(0.9 * data)[1])
     assert np.abs(packed(again) - expected).max() < 1e-8 * np.abs(expected).max()
+
+
+def test_filter_of_maps_from_which_templates_were_subtracted_equals_a_dense_solve() -> None:
+    """C^-1 - C^-1 T (T^t C^-1 T)^-1 T^t C^-1: of any amplitude of the templates the result is the same."""
+    one = map_filter(0, 1e-10, FITTED)
+    _, operator = filtered_covariance(one)
+    data = np.random.default_rng(5).normal(size=12 * NSIDE**2) * 50.0
+    expected = operator @ data
+    scale = np.abs(expected).max()
+    assert np.abs(expected - filtered_covariance(map_filter(0))[1] @ data).max() > 0.01 * scale
+    for size in (0.0, 3000.0):
+        assert np.abs(packed(one.apply(data + size * FITTED.sum(axis=0))[0]) - expected).max() < 1e-7 * scale
+
+
+@pytest.mark.slow
+def test_variance_behind_subtracted_templates_is_the_inverse_of_the_fisher_matrix(products) -> None:
+    """Probes have templates of no amplitude, which the filter takes for any."""
+    one, draws = map_filter(0, templates=FITTED), 300
+    bands = Bands(TABLES.modes, LMAX, WIDTH, True)
+    covariance, _ = filtered_covariance(one)
+    inverse = np.linalg.inv(information(forms(bands, products), covariance, covariance, True))
+    found = np.stack([bands.sums(estimate(TABLES, one.probe(k))) @ inverse for k in range(draws)])
+    apart = (found - found.mean(axis=0)) ** 2
+    error = apart.std(axis=0) / np.sqrt(draws)
+    pulls = (apart.mean(axis=0) * draws / (draws - 1) - np.diag(inverse)) / error
+    assert np.abs(pulls).max() < 4.5
+    assert abs(pulls.mean()) < 1.0
 
 
 @pytest.mark.parametrize("noise", [lambda z: 100.0 * np.exp(0.8 * z), lambda z: np.where(z > 0.0, 100.0, np.inf)])
@@ -309,6 +344,35 @@ def test_a_run_without_the_key_keeps_its_identity() -> None:
     assert config.from_json(config.to_json(filtered)) == filtered
     assert config.digest(filtered) != config.digest(run(filter="inverse_covariance", summary_bin=4))
     assert config.digest(plain) == config.digest(run(summary_bin=4))
+
+
+def test_a_subtracted_dipole_has_any_amplitude() -> None:
+    """What a prepared run estimates from a sky is what it estimates from the sky with another dipole."""
+    plain = config.to_dict(run(filter="inverse_covariance"))
+    steps = [{"kind": "subtract_dipole"}]
+    shared = survey(config.load(plain | {"preparation": steps}))
+    assert shared.filtering is not None
+    one = shared.filtering.filters[0]
+    assert not one.uniform
+    assert shared.filtering.drawn > 0
+    sky = next(iter(simulate.maps(shared.making, 0)))
+    moved = sky + 3000.0 * np.array(healpy.pix2vec(16, np.arange(12 * 16**2)))[2]
+    found, again = (one.apply(map_uk)[0] for map_uk in (sky, moved))
+    np.testing.assert_allclose(again, found, atol=1e-5 * np.abs(found).max())
+    without = survey(config.load(plain)).filtering
+    assert without is not None
+    # Without the step a dipole of 100 uK is nothing unusual, and 3000 are.
+    np.testing.assert_allclose(found, without.filters[0].apply(sky)[0], atol=0.02 * np.abs(found).max())
+
+
+def test_a_preparation_that_changes_pixels_does_not_go_with_a_filter(tmp_path) -> None:
+    plain = config.to_dict(run(filter="inverse_covariance"))
+    with refused("preparation", "smooth", "biposh.filter"):
+        config.load(plain | {"preparation": [{"kind": "smooth", "fwhm_arcmin": 900.0}]})
+    healpy.write_map(tmp_path / "soft.fits", np.linspace(0.0, 1.0, 12 * 16**2), dtype=np.float64)
+    soft = config.load(plain | {"preparation": [{"kind": "mask", "mask": str(tmp_path / "soft.fits")}]})
+    with refused("preparation", "map.mask"):
+        survey(soft)
 
 
 def test_what_a_filter_cannot_bear_is_refused() -> None:
