@@ -68,10 +68,10 @@ def check_filter(run: Any) -> None:
             raise ValueError('biposh.probes is given without a filter; remove it or set filter = "inverse_covariance"')
         return
     # What is fitted and subtracted has any amplitude for the filter, and masked pixels have no weight.
-    changing = next((one.kind for one in run.preparation if not preparation.keeps_pixels(one)), "")
+    changing = next((one.kind for one in run.preparation if not preparation.may_keep_pixels(one)), "")
     for key, given in (
         ('map.grid = "gl"', run.map.grid == "gl"),
-        (f'[[preparation]] kind = "{changing}"', bool(changing)),
+        (f'[[preparation]] kind = "{changing}"' + " with coefficients" * (changing == "templates"), bool(changing)),
         ('biposh.weighting = "hits"', run.biposh.weighting == "hits"),
         (f"biposh.iterations = {run.biposh.iterations}", run.biposh.iterations > 0),
         ("sky without spectrum", run.sky.spectrum is None),

@@ -134,8 +134,8 @@ Step = Annotated[Degrade | Smooth | SubtractDipole | Templates | Fill | Mask | R
 STEPS = (Degrade, Smooth, SubtractDipole, Templates, Fill, Mask, Rotate)
 
 
-def keeps_pixels(step: Step) -> bool:
-    """Return True for a step that masks, or fits and subtracts; the rest of a map and its noise stay."""
+def may_keep_pixels(step: Step) -> bool:
+    """Return True for a step that fits and subtracts, or masks: the rest of a map stays, but for soft masks."""
     return isinstance(step, SubtractDipole | Mask) or (isinstance(step, Templates) and step.coefficients is None)
 
 

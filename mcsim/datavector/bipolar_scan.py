@@ -61,10 +61,12 @@ class BipolarScan:
 
     @cached_property
     def _sources(self) -> list[tuple[Element, int | None, float]]:
-        """Return what is correlated with the sky: itself, and sum and (sign -1) difference of a channel's residuals."""
+        """Return what is correlated with the sky: itself, and sum and (sign -1) difference of a channel's residuals.
+
+        But for the sum of the only channel under an inverse covariance: it is S^-1 s^, the sky once more.
+        """
         sky = Element("sky", "biposh", self.model.channels, kind="biposh")
         found: list[tuple[Element, int | None, float]] = [(sky, None, 1.0)]
-        # What the inverse covariance leaves of the only channel in all is S^-1 s^, the sky once more.
         alone = len(self.model.channels) == 1 and self.model.inverse is not None
         for channel, name in enumerate(self.model.channels):
             own = Element(name, "biposh", (name,), kind="biposh")

@@ -182,19 +182,23 @@ class SameSkies:
         kind, alone = dict(self.analysis.library)[effect.name], len(self.analysis.model.channels) == 1
         return alone and systematics.acts_through(kind, "beam", "spread")
 
-    def dipole_left(self, found: Sequence[config.Effect]) -> list[config.Effect]:
-        """Return the residual dipole that beams with effects leave in the only channel; [] if they leave none.
+    def dipole_left_uk(self, found: Sequence[config.Effect]) -> Vector:
+        """Return the dipole that beams with effects leave in the only channel, uK, shape (3,); zero with several.
 
         What a simulator of another program sees of a dipole is not known.
         """
         channels, known = self.analysis.model.survey.channels, DipoleResidual.name in dict(self.analysis.library)
         if len(channels) > 1 or not known or self.analysis.source is not None:
-            return []
+            return np.zeros(3)
         before, after = (beam.blm[0, 1].real for beam in self._beams(channels[0], found))
-        left = (after / before - 1.0) * channels[0].site.dipole_uk
-        if not left.any():
+        return np.asarray((after / before - 1.0) * channels[0].site.dipole_uk)
+
+    def dipole_left(self, found: Sequence[config.Effect]) -> list[config.Effect]:
+        """Return the same as the effect of a residual dipole; [] if there is none."""
+        if not (left := self.dipole_left_uk(found)).any():
             return []
-        return [table_of(DipoleResidual(**DipoleResidual.parametrization.nearest(left, np.eye(3))), channels[0].name)]
+        effect = DipoleResidual(**DipoleResidual.parametrization.nearest(left, np.eye(3)))
+        return [table_of(effect, self.analysis.model.channels[0])]
 
     def ahead(self, each: Sequence[config.Effect], skies: int) -> None:
         """Simulate single effects at once that :meth:`of_reference` or :meth:`pair` will be asked for one by one.

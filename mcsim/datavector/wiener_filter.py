@@ -75,7 +75,7 @@ class Model:
     settings: DiagnosisSettings
     #: s^ is that of the mean of all maps, and what they have alike beside it is sky beyond lmax, of this variance, uK^2
     pooled: float = 0.0
-    careful: bool = False  # the inverse covariance is that of CAREFUL
+    tolerance: float = 1.0  # of the inverse covariance, over that of the settings
 
     @property
     def frame(self) -> str:
@@ -121,7 +121,7 @@ class Model:
             return self
         parts = marginalised(self.survey, self.parts)
         inverse = inverse_of(self.cl, self.response, parts, offsets=True)
-        return replace(self, parts=parts, inverse=inverse, careful=True)
+        return replace(self, parts=parts, inverse=inverse, tolerance=CAREFUL)
 
     def of(self, channel: int) -> tuple[int, ...]:
         """Return the indices of the channel's maps."""
@@ -216,7 +216,7 @@ def _pooled(model: Model, unresolved: Matrix) -> Model:
         inverse=_of_mean(model.cl, response, precision),
         sky_power=snr / (1.0 + snr),
         pooled=alike,
-        careful=True,
+        tolerance=CAREFUL,
     )
 
 
@@ -392,7 +392,7 @@ def _sky(model: Model, clean: Sequence[Map], careful: bool = False) -> Alm:
     if model.inverse is not None:
         maps = divided(*_summed(model, clean))[None] if model.pooled else np.stack(clean)
         weighted = model.inverse.adjoint(model.inverse.weighted(maps))
-        tolerance = settings.filter_tolerance * (0.01 if careful else 1.0) * (CAREFUL if model.careful else 1.0)
+        tolerance = settings.filter_tolerance * model.tolerance * (0.01 if careful else 1.0)
         return model.inverse.approach(weighted, tolerance, settings.filter_iterations)
     total = np.zeros(alm_.size(lmax), dtype=np.complex128)
     gain = np.zeros(lmax + 1)

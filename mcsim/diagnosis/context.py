@@ -172,9 +172,9 @@ class DataSet(ABC, Generic[Data]):
         """Return True if responses to effects depend on what these have done to the sky that the data are of."""
         return False
 
-    def crossed(self, found: Sequence[config.Effect]) -> bool:
-        """Return True if effects respond by products with the observed sky that templates of other skies lack."""
-        return False
+    def dipole_snr(self, found: Sequence[config.Effect]) -> float:
+        """Return the S/N of the dipole that effects leave in the only channel, whose products with its sky count."""
+        return 0.0
 
     def templates(self) -> Matrix:
         """Return the templates for these data, shape (p, K)."""

@@ -31,7 +31,8 @@ class Controls:
     Controls of a right model have p-values that are uniform over data and simulations. They fail if the smallest of N,
     times N (Bonferroni), or the p-value of the Kolmogorov-Smirnov test against uniformity is below ``LEVEL``: those of
     at most 2 % of right models. All p-values share the error of the model's simulations, so that the test is that of
-    two samples, controls and simulations. Rates: tests/statistical/test_control_rates.py.
+    two samples, controls and simulations. That is cautious: ranks among simulations would share more than these do.
+    Rates: tests/statistical/test_control_rates.py.
     """
 
     members: tuple[Control, ...]  #: one for each control

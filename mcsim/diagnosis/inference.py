@@ -17,7 +17,7 @@ from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import as_seen
 from mcsim.diagnosis.naming import agreeing, unconfirmed
-from mcsim.diagnosis.partial import Detector
+from mcsim.diagnosis.partial import PartialSearch
 from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.rivals import with_rivals
@@ -54,7 +54,7 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
             found, reduction = found.unexplained(), None
     # What the rest of the data contradicts is not detected in it.
     if detected is None and not (exchanged or refusals) and not found.faint and found.verdict == "unknown":
-        detected = Detector(data).run(refined.templates, refined.candidates)
+        detected = PartialSearch(data).run(refined.templates, refined.candidates)
     notes += refusals
     for own in found.explanations[:1] if detected is None else [detected]:
         notes += as_seen(context, own.members, own.fit)

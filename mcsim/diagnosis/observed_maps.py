@@ -114,9 +114,11 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         """Return True if the observed sky has to be found as effects let the channels see it."""
         return any(self.same_skies.seen(found))
 
-    def crossed(self, found: Sequence[config.Effect]) -> bool:
-        """Return True if effects leave a dipole in the only channel, whose products with the sky are the observed."""
-        return bool(self.same_skies.dipole_left(found))
+    def dipole_snr(self, found: Sequence[config.Effect]) -> float:
+        """Return the S/N of the dipole that effects leave in the only channel, 0 with several, by noise alone."""
+        noise = 1.0 / sum(1.0 / part.noise_power for part in self.context.analysis.model.parts)  # of a_lm, uK^2 sr
+        left = np.linalg.norm(self.same_skies.dipole_left_uk(found))
+        return float(left / np.sqrt(3.0 / (4.0 * np.pi) * noise))
 
     def templates(self) -> Matrix:
         """Return the templates; those that depend on the very sky are measured on the observed one if it departs."""

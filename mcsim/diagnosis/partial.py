@@ -32,7 +32,7 @@ class PartialExplanation:
 
 
 @dataclass(frozen=True)
-class Detector:
+class PartialSearch:
     """Add candidates to those that are detected in data, one by one."""
 
     data: DataSet[Any]
@@ -101,7 +101,7 @@ class Detector:
                 effects = effects_at(candidates, members, fitted)
                 tables = [candidates[member].table(effect) for member, effect in zip(members, effects, strict=True)]
                 stochastic = any(effect.parametrization.stochastic for effect in effects)
-                response = self.data.respond(tables, skies(self.context.settings, stochastic)).mean(axis=0)
+                response = self.data.respond(tables, number_of_skies(self.context.settings, stochastic)).mean(axis=0)
             except InputError:
                 return None
             t = t.copy()
@@ -113,7 +113,7 @@ class Detector:
         return None
 
 
-def skies(settings: DiagnosisSettings, stochastic: bool) -> int:
+def number_of_skies(settings: DiagnosisSettings, stochastic: bool) -> int:
     """Return how many constrained skies the response to effects is averaged over."""
     return settings.scatter_skies if stochastic else settings.constrained_skies
 

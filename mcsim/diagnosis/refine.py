@@ -8,7 +8,7 @@ from scipy import special
 
 from mcsim.datavector.candidate import Candidate, columns_of, parts_of, scatters_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
-from mcsim.diagnosis.partial import Detector, PartialExplanation, beyond, has_settled, skies
+from mcsim.diagnosis.partial import PartialExplanation, PartialSearch, beyond, has_settled, number_of_skies
 from mcsim.diagnosis.selection import Attribution, Explanation, Selection, attributed
 from mcsim.errors import InputError
 from mcsim.stats.detection import cosines
@@ -66,8 +66,8 @@ class Refiner:
         which grows as the square of the amplitude, the secant at a_0 finds a^2/a_0 for a: the mean of this and a_0 is
         Newton's step. With the scatter that it has at the amplitude of a set, a stochastic one may not suffice though
         it is all: it is tried at the amplitude that it has alone, too, and so is what was simulated far from there in a
-        set of effects that are alike. Members of the best sets are always simulated, and what is like them where a set
-        suffices only because errors of templates are tolerated.
+        set of effects that are alike. Members of the best sets are always simulated, and what is like them where its
+        templates may be why it fits worse.
         """
         now = _Responses(t, t.copy(), list(candidates))
         first = found = self._attribute(now.t, now.candidates)
@@ -90,7 +90,7 @@ class Refiner:
             if (index,) in [one.members for one in own.explanations]:
                 now, found = alone, own
                 break
-        detected = Detector(self.data).run(now.t, now.candidates) if found.verdict == "unknown" else None
+        detected = PartialSearch(self.data).run(now.t, now.candidates) if found.verdict == "unknown" else None
         if detected is not None and len(detected.members) <= self.context.settings.max_effects:
             done = {member: now.done.get(member) for member in detected.members}
             beside = _Responses(now.linear, detected.templates.copy(), [*now.candidates], done)
@@ -146,8 +146,8 @@ class Refiner:
 
         All of them if the residual does not pass without an error of the templates: far from linear responses what is
         tolerated is much, and what is there looks worse than what is like it until it is simulated. Otherwise those
-        that respond to the observed sky, and those whose response bends so much there that it may be all that they fit
-        worse by.
+        that leave a dipole in the only channel, and those whose response bends so much there that it may be all that
+        they fit worse by.
         """
         tolerated = one.fit.pvalue <= self.context.settings.residual_level
         cosine = cosines(self.context.null.whiten_groups(now.linear, [own.columns for own in now.candidates]))
@@ -156,25 +156,30 @@ class Refiner:
             others = tuple(other for other in one.members if other != member)
             taken = {now.candidates[other].identity for other in others}
             for index in np.flatnonzero(cosine[member] >= ALIKE).tolist():
-                candidate = now.candidates[index]
-                if index in now.done or candidate.identity in taken:
+                if index in now.done or now.candidates[index].identity in taken:
                     continue
-                if tolerated or self._is_crossed(candidate) or self._may_replace(now, one, others, index):
+                if tolerated or self._may_replace(now, one, others, index):
                     found.setdefault(index, others)
         return [(others, index) for index, others in found.items()]
 
-    def _is_crossed(self, candidate: Candidate) -> bool:
-        return self.data.crossed([candidate.table(effect) for effect in candidate.basis])
+    def _dipole_snr(self, candidate: Candidate, coordinates: Vector, covariance: Matrix) -> float:
+        """Return the S/N of the dipole that a candidate leaves in the only channel; 0 if it can have no such size."""
+        try:
+            return self.data.dipole_snr([candidate.table(candidate.detected(coordinates, covariance))])
+        except InputError:
+            return 0.0
 
     def _may_replace(self, now: "_Responses", one: Explanation, others: tuple[int, ...], index: int) -> bool:
         """Return True if an effect fits worse than a set beside others by no more than its bent response may cost it.
 
         A template that is wrong by b standard deviations raises chi^2 of the true effect by b^2 on average, with a
-        scatter of 2 b.
+        scatter of 2 b. By how much the products of a dipole with the observed sky are wrong is not known.
         """
         together = (*others, index)
         fit = self.context.null.fit(self.data.x, now.t[:, columns_of(now.candidates, together)])
-        *_, (_, coordinates, _) = parts_of(now.candidates, together, fit)
+        *_, (_, coordinates, covariance) = parts_of(now.candidates, together, fit)
+        if self._dipole_snr(now.candidates[index], coordinates, covariance) > self.context.settings.nonlinear_sigma:
+            return True
         bend = self._bend(list(now.candidates[index].columns), coordinates)
         allowed = (bend + 2.0) ** 2 + 2.0 * np.log(self.context.settings.odds_cut)
         return bend > self.context.settings.nonlinear_sigma and fit.chi2 - one.fit.chi2 <= allowed
@@ -281,7 +286,7 @@ class Refiner:
                 tables = [candidate.table(effect)]
                 pair = None if stochastic else self.data.pair(tables)
                 changes = (
-                    self.data.respond(tables, skies(self.context.settings, stochastic))
+                    self.data.respond(tables, number_of_skies(self.context.settings, stochastic))
                     if pair is None
                     else pair[1] - pair[0]
                 )

@@ -134,8 +134,11 @@ def dipoles_left(survey: Survey) -> dict[str, float]:
 
 
 def _weighted(survey: Survey, m: SurveyMap) -> SurveyMap:
-    """Return a map with the weights that its estimates are of: none if their normalisation takes them out."""
-    return m if survey.filtering is None else replace(m, weight=None)
+    """Return a map with the weights that its estimates are of: before masks if their normalisation takes these out."""
+    if survey.filtering is None:
+        return m
+    made = next(one for one in survey.making.maps if one.name == m.name)
+    return replace(made, weight=None)
 
 
 def without_windows(

@@ -345,7 +345,8 @@ def cost(run: config.RunConfig) -> Cost:
         transforms, memory = transforms + extra, memory + 480.0 * nside**2
         grid = f"nside {nside} to {config.prepared_grid(run)[0]}"
         words = f"{extra:g} further transforms per realization and {480e-9 * nside**2:.2g} GB per worker, {grid}"
-        parts.append(("prepare", words))
+        if not run.biposh.filtered:  # the filter knows what was subtracted and masked
+            parts.append(("prepare", words))
     order = run.map.offset_order or 0
     if order > 1:
         spread = [channel for channel in run.channels if not isinstance(channel.scan, config.ScanParallelTransport)]
@@ -366,7 +367,7 @@ def cost(run: config.RunConfig) -> Cost:
         words = (
             f"about {SOLUTION * solutions:.0f} further transforms per realization; once, {probes} random maps of each "
             f"map, {duration(once_s)} of processor time and {1e-9 * DRAWING * max(matrices):.2g} GB more of the "
-            "command (none if the noise is uniform on the full sky)"
+            "command (none if the noise is uniform on the full sky, and nothing was fitted and subtracted)"
         )
         parts.append(("filter", words))
     parts += [("noise", line) for line in noise.in_words(run)]

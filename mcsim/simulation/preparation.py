@@ -189,10 +189,13 @@ def regressions(preparations: Sequence[Preparation | None]) -> list[list[tuple[N
 
 def templates_of(preparations: Sequence[Preparation | None]) -> list[NDArray[np.float64] | None]:
     """Return all that is fitted and subtracted from every map, shape (K, npix); None: nothing."""
-    found: list[NDArray[np.float64] | None] = []
+    made: dict[tuple[int, ...], NDArray[np.float64] | None] = {(): None}
+    found = []
     for columns in ([one for one, _ in own] for own in regressions(preparations)):
-        # One alone is the same array in all maps that have it.
-        found.append(np.concatenate(columns) if len(columns) > 1 else next(iter(columns), None))
+        key = tuple(map(id, columns))  # equal ones are the same
+        if key not in made:
+            made[key] = columns[0] if len(columns) == 1 else np.concatenate(columns)
+        found.append(made[key])
     return found
 
 

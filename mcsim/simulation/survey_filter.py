@@ -23,7 +23,7 @@ def filtering_of(
     spectra_of: tuple[tuple[tuple[int, int], ...], Estimator],
     nthreads: int,
 ) -> Filtering | None:
-    """Return the filters of a survey's maps: circular part of the fiducial beams, white noise, fits of any amplitude.
+    """Return the filters of a survey's maps: circular part of the fiducial beams, white noise, whatever was subtracted.
 
     ``channels``: before their maps are prepared, and after. None: the run does not filter. InputError for a preparation
     that does more than fit and subtract, and mask.
@@ -36,7 +36,7 @@ def filtering_of(
     if not keeps_pixels(preparations):
         raise InputError(
             'a mask of [[preparation]] has weights between 0 and 1, which biposh.filter = "inverse_covariance" would '
-            "not know of the noise; give it as map.mask, or zeros and ones."
+            "not know of the noise; give it as map.mask, or as zeros and ones in the nside of the maps."
         )
     filters = []
     for (channel, m), (_, analysed), templates in zip(made, prepared, templates_of(preparations), strict=True):

@@ -9,7 +9,7 @@ from scipy import stats
 
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.diagnosis.partial import Detector
+from mcsim.diagnosis.partial import PartialSearch
 from mcsim.stats.gaussian import SimulatedGaussian, nested_pvalue
 from mcsim.stats.look_elsewhere import Calibration
 from mcsim.systematics import Bound, Effect, Parametrization
@@ -41,7 +41,7 @@ class Known:
     def pvalue(self, z: float, besides: float = 0.0) -> float:
         """Return the p-value of the second template, at z errors beside the first, which is strong."""
         x = np.array([30.0, z, 0.0, 0.0, 0.0, besides])
-        beside = Detector(SimpleNamespace(context=self.context, x=x))._beside
+        beside = PartialSearch(SimpleNamespace(context=self.context, x=x))._beside
         return float(beside(self.t, self.candidates, (0,))[1])
 
 

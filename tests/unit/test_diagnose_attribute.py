@@ -14,7 +14,7 @@ from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import words
 from mcsim.diagnosis.inference import confirmed
-from mcsim.diagnosis.partial import Detector, PartialExplanation
+from mcsim.diagnosis.partial import PartialExplanation, PartialSearch
 from mcsim.diagnosis.selection import Attribution, Contrast, attribute
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.stats.excess import HeldOut, Measured
@@ -349,7 +349,7 @@ def detected(bench: Bench, x: np.ndarray, exact=lambda t, members: t, candidates
     """What is detected in data if ``exact`` gives the templates of effects that act together."""
     context = SimpleNamespace(null=bench.null, calibration=bench.calibration, settings=DiagnosisSettings())
 
-    class Straight(Detector):
+    class Straight(PartialSearch):
         def _together(self, candidates, t, members):
             return exact(t, members)
 

@@ -8,7 +8,7 @@ import pytest
 
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.diagnosis.partial import Detector
+from mcsim.diagnosis.partial import PartialSearch
 from mcsim.diagnosis.refine import Refiner
 from mcsim.diagnosis.selection import attribute
 from mcsim.errors import InputError
@@ -80,7 +80,7 @@ class Instrument:
         bank = SimpleNamespace(curvature=self.curvature)
         context = SimpleNamespace(null=self.null, calibration=self.calibration, bank=bank, settings=self.settings)
         own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter, "rescaled": lambda tables: False}
-        own["crossed"] = lambda tables: tables[0].channel in self.crossed
+        own["dipole_snr"] = lambda tables: float(tables[0].channel in self.crossed)
         groups = self.null.whiten_groups(self.t, [one.columns for one in self.candidates])
         gap = global_test(self.null, x, groups, self.calibration)
         data = SimpleNamespace(context=context, x=x, realizations=1, gap=gap, **own)
@@ -216,10 +216,10 @@ def test_effects_that_change_each_other_are_simulated_together():
     ("cross", "last"), [(0.0, {"B"}), (0.06, {"C"})], ids=["at the end", "beside what is detected"]
 )
 def test_no_set_is_named_before_each_member_is_simulated(monkeypatch, cross, last):
-    instrument, run = Instrument(bend=0.0, cross=cross), Detector.run
+    instrument, run = Instrument(bend=0.0, cross=cross), PartialSearch.run
     x = instrument.response(12.0, 14.0) + (8.0 * instrument.t[:, 2] if cross else 0.0)
     monkeypatch.setattr(Refiner, "_to_try", lambda *_: [])
-    monkeypatch.setattr(Detector, "run", lambda *own: replace(run(*own), members=(0, 1)))
+    monkeypatch.setattr(PartialSearch, "run", lambda *own: replace(run(*own), members=(0, 1)))
     found = instrument.refined(x).attribution
     assert found.explanations[0].members == ((0, 1, 2) if cross else (0, 1))
     assert instrument.analysis[-1].keys() == last

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import wignernj
 
+import mcsim
 from mcsim import config
 from mcsim.bipolar import Mode, estimate, estimator, parse_mode
 from mcsim.bipolar.modes import bin_factor
@@ -95,7 +96,7 @@ def test_filter_equals_a_dense_solve(filters) -> None:
 
 
 def test_filter_of_maps_from_which_templates_were_subtracted_equals_a_dense_solve() -> None:
-    """C^-1 - C^-1 T (T^t C^-1 T)^-1 T^t C^-1: of any amplitude of the templates the result is the same."""
+    """C^-1 - C^-1 T (T^t C^-1 T)^-1 T^t C^-1: the same whatever the amplitude of the templates is."""
     one = map_filter(0, 1e-10, FITTED)
     _, operator = filtered_covariance(one)
     data = np.random.default_rng(5).normal(size=12 * NSIDE**2) * 50.0
@@ -361,7 +362,7 @@ def test_a_subtracted_dipole_has_any_amplitude() -> None:
     np.testing.assert_allclose(again, found, atol=1e-5 * np.abs(found).max())
     without = survey(config.load(plain)).filtering
     assert without is not None
-    # Without the step a dipole of 100 uK is nothing unusual, and 3000 are.
+    # Without the step a dipole of 100 uK is nothing unusual, and one of 3000 is.
     np.testing.assert_allclose(found, without.filters[0].apply(sky)[0], atol=0.02 * np.abs(found).max())
 
 
@@ -401,3 +402,17 @@ def test_more_numbers_than_the_maps_tell_apart_are_refused() -> None:
                 response.checked()
         else:
             assert response.checked() is response
+
+
+def test_predictions_behind_a_mask_do_not_depend_on_where_it_is_declared(tmp_path) -> None:
+    """Estimates are those of the full sky; moments of prepared maps are zero behind their mask."""
+    path, height = tmp_path / "mask.fits", healpy.pix2vec(16, np.arange(12 * 16**2))[2]
+    healpy.write_map(path, (np.abs(height) > 0.35).astype(float), dtype=np.float64)
+    plain = config.to_dict(run(filter="inverse_covariance", lmax=24))
+    plain["sky"]["lmax"] = 32
+    own = plain | {"map": plain["map"] | {"mask": str(path), "mask_frame": "ecliptic"}}
+    step = plain | {"preparation": [{"kind": "mask", "mask": str(path), "mask_frame": "ecliptic"}]}
+    first, second = (mcsim.predict(config.load(one)) for one in (own, step))
+    for name in ("biposh_difference_mean", "biposh_qml_difference_mean"):
+        expected = first[name].values
+        np.testing.assert_allclose(second[name].values, expected, atol=2e-3 * np.nanmax(np.abs(expected)))
