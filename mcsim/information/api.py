@@ -22,8 +22,8 @@ from mcsim.information.result import Limits, limits_of
 from mcsim.information.settings import LimitSettings
 from mcsim.simulation import convolve
 from mcsim.simulation.channels import refuse_external
-from mcsim.simulation.filtering import unknown_dipole
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
+from mcsim.simulation.map_filter import unknown_dipole
 from mcsim.simulation.nuisance import nuisances_of
 from mcsim.simulation.preparation import keeps_pixels, templates_of
 from mcsim.simulation.survey import survey

@@ -21,7 +21,8 @@ from mcsim.bipolar import power_spectrum
 from mcsim.errors import InputError
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
-from mcsim.simulation.filtering import LOWEST, MapFilter
+from mcsim.simulation.filtering import LOWEST
+from mcsim.simulation.map_filter import MapFilter
 from mcsim.sphere import healpix
 from mcsim.support.arrays import Alm, Map, Matrix, Vector
 
@@ -82,9 +83,9 @@ class BeamModes:
         return np.asarray(np.add.reduceat(self._shape != 0.0, self.first, axis=-1) > 0)
 
     def weighted(self, map_uk: Map) -> Weighted:
-        """Return what a map contributes; it takes a solution of its inverse covariance."""
+        """Return what a map contributes; it takes a solution of its inverse covariance. InputError as of the filter."""
         inverse = self.filter.inverse
-        observed = np.where(inverse.precision[0] > 0.0, map_uk, 0.0)[None]
+        observed = self.filter.observed(map_uk)
         sky = inverse.wiener(observed)
         y = inverse.apply(observed, sky)[0]
         turned = [convolve.turned([(y, self.moments)], s) for s in range(1, self.orders + 1)]

@@ -29,100 +29,17 @@ from numpy.typing import NDArray
 from mcsim.bipolar import Estimator, estimate, power_spectrum
 from mcsim.bipolar.modes import Mode, bin_factor, existing
 from mcsim.errors import InputError
-from mcsim.simulation.inverse_covariance import InverseCovariance
-from mcsim.sphere import alm as alm_
-from mcsim.sphere import healpix
+from mcsim.simulation.map_filter import MapFilter
 from mcsim.support import folders
-from mcsim.support.arrays import Alm, Map, Matrix, Vector, divided
+from mcsim.support.arrays import Alm, Matrix, Vector, divided
 from mcsim.support.code import package_digest
 
 LOWEST = 2  #: lowest degree in bins: the monopole and the dipole of a map are not those of its sky
 PAIRS = 20  #: pairs of random probes for each number whose Fisher matrix they estimate
 LEAST_PAIRS = 2  #: the least number of the same with which a matrix is inverted
-LEVELS = 1024  #: of the noise that predictions tell apart
-TOLERANCE = 1e-6  #: relative residual at which the inverse covariance of a map is found
 APART = 1e-8  #: smallest eigenvalue of the correlation of the Fisher matrix over the largest, of numbers told apart
 
-DIPOLE_UK = 100.0
-"""Rms of the monopole and of the dipole that maps may have besides their sky, so that nothing is learnt from them."""
-
 Progress = Callable[[float], None]
-
-
-def unknown_dipole(cl: Vector, rms_uk: float = DIPOLE_UK) -> Vector:
-    """Return the spectrum with an unknown monopole and dipole of this rms, uK^2."""
-    found = cl.copy()
-    found[:2] += (4.0 * np.pi * rms_uk**2 / np.array([1.0, 3.0]))[: cl.size]
-    return found
-
-
-@dataclass(frozen=True, eq=False)
-class MapFilter:
-    """Filter of one map."""
-
-    name: str  #: of the map
-    inverse: InverseCovariance  #: its inverse covariance, with circular beam and pixel window as response
-    window: Vector  #: pixel window that the analysis divides out, shape (>= lmax + 1,)
-    lmax: int  #: highest degree of the result
-
-    @cached_property
-    def total(self) -> Vector:
-        """Return C_l of the map over its pixel window if its noise were uniform, uK^2, shape (lmax of the sky + 1,)."""
-        noise = 4.0 * np.pi / self.inverse.npix / self._precision[self._precision > 0.0].mean()
-        return np.asarray(self.inverse.cl * self._beam**2 + noise / self.window[: self.inverse.lmax + 1] ** 2)
-
-    @property
-    def uniform(self) -> bool:
-        """Return True if all pixels have the same noise, and nothing was fitted: the filter is then diagonal."""
-        return self.inverse.maps[0].templates is None and bool(np.all(self._precision == self._precision[0]))
-
-    def noise(self, power: Map) -> Vector:
-        """Return the mean C_l of noise in what the filter measures, uK^2, shape (lmax of the sky + 1,).
-
-        ``power`` is its variance times the pixel area, uK^2 sr, shape (npix,). Noise that changes slowly over the
-        wavelength of a degree counts as the filter weights the pixels there, by w^2 with w = 1 / C_l of sky and noise.
-        """
-        seen = self._precision > 0.0
-        order = np.argsort(self._precision[seen])
-        parts = np.array_split(order, min(order.size, LEVELS))
-        precision, mean = (np.array([one[seen][part].mean() for part in parts]) for one in (self._precision, power))
-        square = self.window[: self.inverse.lmax + 1, None] ** 2
-        expected = 4.0 * np.pi / self.inverse.npix / precision / square
-        weight = ((self.inverse.cl * self._beam**2)[:, None] + expected) ** -2.0 * [part.size for part in parts]
-        return np.asarray((weight * mean / square).sum(axis=1) / weight.sum(axis=1))
-
-    def apply(self, map_uk: Map, near: Alm | None = None) -> tuple[Alm, Alm]:
-        """Return the filtered coefficients, uK^-1, and the Wiener-filtered sky, uK, near which the next ones may be."""
-        window = self.window[: self.inverse.lmax + 1]
-        if self.uniform:
-            alm = healpix.analysis(map_uk, self.lmax, nthreads=self.inverse.nthreads)
-            found = alm_.multiply(alm, 1.0 / (window * self.total), self.lmax)
-            sky = alm_.multiply(found, self.inverse.cl * self._beam, self.lmax)
-            return found, alm_.resize(sky, self.lmax, self.inverse.lmax)
-        observed = np.where(self._precision > 0.0, map_uk, 0.0)[None]
-        inverse = self.inverse
-        sky = inverse.solve(inverse.adjoint(inverse.weighted(observed)), near)
-        found = healpix.adjoint(inverse.apply(observed, sky)[0], inverse.lmax, inverse.nthreads)
-        found = alm_.multiply(found, window, inverse.lmax)
-        # Where the sky is far above the noise the difference of the two loses digits; s^ = S B x does not.
-        power = inverse.cl * self._beam
-        bright = alm_.degrees(inverse.lmax) <= np.max(np.flatnonzero(power * self._beam > self.total / 2.0), initial=-1)
-        usable = bright & (power[alm_.degrees(inverse.lmax)] > 0.0)
-        found = np.where(usable, alm_.multiply(sky, divided(1.0, power), inverse.lmax), found)
-        return alm_.resize(found, inverse.lmax, self.lmax), sky
-
-    def probe(self, number: int) -> Alm:
-        """Return filtered coefficients of random data of the filter's own covariance."""
-        return self.apply(self.inverse.draw(f"filter/{self.name}", number)[0])[0]
-
-    @property
-    def _precision(self) -> Map:
-        return self.inverse.maps[0].precision
-
-    @property
-    def _beam(self) -> Vector:
-        response = self.inverse.maps[0].response.factors[0].real
-        return np.asarray(response / self.window[: self.inverse.lmax + 1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -434,7 +351,8 @@ class Filtering:
 
     def _key(self) -> str:
         """Return what the normalisation depends on, hashed."""
-        code = ("mcsim.simulation.filtering", "mcsim.simulation.inverse_covariance", "mcsim.bipolar", "mcsim.sphere")
+        simulation = (f"mcsim.simulation.{name}" for name in ("filtering", "map_filter", "inverse_covariance"))
+        code = (*simulation, "mcsim.bipolar", "mcsim.sphere")
         modes = [tuple(mode) for mode in self.tables.modes]
         text = f"{modes} {self.tables.lmax} {self.width} {self.drawn} {self.pairs} {package_digest(code, ['ducc0'])}"
         found = hashlib.sha256(text.encode())

@@ -168,7 +168,7 @@ def _prepared(
 
 
 def _filtered(survey: Survey, m: SurveyMap, parts: MapParts) -> tuple[Alm, Alm | None]:
-    """Return a map, and its control where there is one, as :class:`mcsim.simulation.filtering.MapFilter` has them.
+    """Return a map, and its control where there is one, as :class:`mcsim.simulation.map_filter.MapFilter` has them.
 
     What a preparation subtracts and masks is nothing to the filter, so it is not done.
     """

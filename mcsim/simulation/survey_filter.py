@@ -10,8 +10,9 @@ from mcsim import config
 from mcsim.bipolar import Estimator
 from mcsim.errors import InputError
 from mcsim.simulation import convolve
-from mcsim.simulation.filtering import TOLERANCE, Filtering, MapFilter, unknown_dipole
+from mcsim.simulation.filtering import Filtering
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
+from mcsim.simulation.map_filter import TOLERANCE, MapFilter, unknown_dipole
 from mcsim.simulation.preparation import keeps_pixels, templates_of
 from mcsim.support.arrays import divided
 

@@ -8,8 +8,8 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import convolve
 from mcsim.simulation.beam_modes import BeamModes
-from mcsim.simulation.filtering import MapFilter, unknown_dipole
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap, unit_skies
+from mcsim.simulation.map_filter import MapFilter, unknown_dipole
 from mcsim.sphere import healpix
 from refusals import refused
 

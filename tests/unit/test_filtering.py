@@ -11,8 +11,9 @@ from mcsim.bipolar import Mode, estimate, estimator, parse_mode
 from mcsim.bipolar.modes import bin_factor
 from mcsim.instrument.beams import Beam
 from mcsim.simulation import convolve, simulate
-from mcsim.simulation.filtering import LOWEST, Bands, Filtering, MapFilter, Response, _unbiased, unknown_dipole
+from mcsim.simulation.filtering import LOWEST, Bands, Filtering, Response, _unbiased
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap, product, unit_skies
+from mcsim.simulation.map_filter import MapFilter, unknown_dipole
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
@@ -345,6 +346,18 @@ def test_a_run_without_the_key_keeps_its_identity() -> None:
     assert config.from_json(config.to_json(filtered)) == filtered
     assert config.digest(filtered) != config.digest(run(filter="inverse_covariance", summary_bin=4))
     assert config.digest(plain) == config.digest(run(summary_bin=4))
+
+
+def test_a_map_without_values_that_a_filter_weights_is_refused() -> None:
+    """UNSEEN is -1.6e30 uK to a filter that does not look."""
+    one = map_filter(0)
+    hidden = np.where(one.inverse.precision[0] > 0.0, 1.0, healpy.UNSEEN)
+    assert np.isfinite(one.apply(hidden)[0]).all()
+    for bad in (healpy.UNSEEN, np.nan, np.inf):
+        with refused("map0", 3, "map.mask"):
+            one.apply(np.where(np.cumsum(one.inverse.precision[0] > 0.0) <= 3, bad, 1.0))
+    with refused("map0", 8):
+        one.apply(np.ones(12 * 4**2))
 
 
 def test_a_subtracted_dipole_has_any_amplitude() -> None:
