@@ -54,6 +54,8 @@ class DiagnosisSettings:
         Largest number of effects that act together.
     named_probability
         Posterior probability below which the accepted sets of a faint gap are not named.
+    faint_pvalue
+        Global p-value above which sets have to be so probable by the templates that were known before the data, too.
     odds_cut
         Explanations that are less probable than the best by this factor are left out.
     template_error
@@ -196,6 +198,7 @@ class DiagnosisSettings:
     further_level: float = 0.005
     max_effects: int = 6
     named_probability: float = 0.5
+    faint_pvalue: float = 0.01
     odds_cut: float = 100.0
     template_error: float = 0.01
     prior_snr: tuple[float, ...] = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0)

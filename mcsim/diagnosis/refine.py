@@ -67,7 +67,7 @@ class Refiner:
         Newton's step. With the scatter that it has at the amplitude of a set, a stochastic one may not suffice though
         it is all: it is tried at the amplitude that it has alone, too, and so is what was simulated far from there in a
         set of effects that are alike. Members of the best sets are always simulated, and what is like them where its
-        templates may be why it fits worse.
+        templates may be why it fits worse. A faint gap has the odds of the first templates at most.
         """
         now = _Responses(t, t.copy(), list(candidates))
         first = found = self._attribute(now.t, now.candidates)
@@ -97,6 +97,9 @@ class Refiner:
             together = self._completed(beside, self._attribute(beside.t, beside.candidates))
             if together.explanations:
                 now, found, detected = beside, together, None
+        if found.gap.pvalue > self.context.settings.faint_pvalue:
+            # Templates that were simulated at what noise looks like follow noise: the odds of a faint gap are theirs.
+            found = replace(found, probability=min(found.probability, first.probability))
         return Refined(found, now.t, tuple(now.candidates), detected)
 
     def _of_sets(self, now: "_Responses", sets: Sequence[tuple[int, ...]]) -> Iterator[tuple[int, Vector, Matrix]]:

@@ -201,6 +201,21 @@ def test_an_effect_may_leave_the_chi2_that_its_scatter_adds(noise, verdict):
     assert instrument.refined(x).attribution.verdict == verdict
 
 
+@pytest.mark.parametrize(("along", "faint"), [(2.9, True), (4.5, False)])
+def test_a_faint_gap_has_the_odds_of_templates_that_were_known_before(along, faint):
+    """The bend explains 3 more of the noise, which is no evidence for what was simulated at the amplitude of noise."""
+    instrument = Instrument(bend=3.0 / along**2, cross=0.0)
+    x = instrument.response(along, 0.0)
+    plain = attribute(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration)
+    found = instrument.refined(x).attribution
+    assert (found.gap.pvalue > instrument.settings.faint_pvalue) == faint
+    assert found.verdict == "effect"
+    if faint:
+        assert found.probability == plain.probability < 0.8
+    else:
+        assert found.probability > max(plain.probability, 0.9)
+
+
 def test_effects_that_change_each_other_are_simulated_together():
     instrument = Instrument(bend=0.0, cross=0.06)
     x = instrument.response(12.0, 14.0)
