@@ -24,13 +24,16 @@ def pvalues():
     return np.array(rows)
 
 
+def controls(pvalues):
+    return Controls(tuple(Control(p, "none", ()) for p in pvalues), "x", 0.05, SIMULATIONS)
+
+
 @pytest.mark.parametrize("count", [30, 300, 1000])
 def test_controls_of_right_models_seldom_fail(pvalues, count):
-    controls = [Controls(tuple(Control(p, "none", ()) for p in row), "x", 0.05, SIMULATIONS) for row in pvalues]
-    failed = sum(Controls(one.members[:count], "x", 0.05, SIMULATIONS).failed for one in controls)
+    failed = sum(controls(row[:count]).failed for row in pvalues)
     assert failed <= stats.binom.ppf(0.999, MODELS, 2.0 * LEVEL)
 
 
 def test_controls_with_too_many_small_p_values_fail():
     wrong = np.random.default_rng(1).uniform(size=1000) ** 1.5  # 13.6 % of them are below 0.05
-    assert Controls(tuple(Control(p, "none", ()) for p in wrong), "x", 0.05, SIMULATIONS).uniformity < LEVEL
+    assert controls(wrong).uniformity < LEVEL
