@@ -25,6 +25,7 @@ from mcsim.simulation.nuisance import DisturbedSurvey, Nuisance, check_nuisances
 from mcsim.simulation.survey import Survey, survey
 from mcsim.simulation.timestream import CorrelatedNoise
 from mcsim.sphere import alm as alm_
+from mcsim.sphere import rotation
 from mcsim.support.arrays import Alm, Map, Vector
 from mcsim.systematics import Effect, Library, acts_through
 
@@ -382,7 +383,8 @@ def _constrained_sky(definition: tuple[Any, ...], observed: bytes, seed: int, re
     Notes
     -----
     Hoffman & Ribak, ApJ 380, L5 (1991). The noise of these maps is independent of that of the realization itself:
-    otherwise sky and noise would be correlated, and every response too small by the filter of s^.
+    otherwise sky and noise would be correlated, and every response too small by the filter of s^. A sky is drawn in the
+    frame in which maps are made; s^ is in that of the prepared ones.
     """
     model = _analysis(*definition).model
     run = model.survey.config
@@ -390,7 +392,8 @@ def _constrained_sky(definition: tuple[Any, ...], observed: bytes, seed: int, re
     sky = simulate.draw_sky(drawn, realization)
     filtered = shared_sky(model, list(simulate.maps(drawn, realization + _OTHER_NOISE, sky=sky)))
     difference = np.frombuffer(observed, dtype=np.complex128) - filtered
-    return np.asarray(sky + alm_.resize(difference, model.lmax, run.sky.lmax))
+    found = rotation.rotate_alm(difference, model.lmax, model.frame, run.map.frame)
+    return np.asarray(sky + alm_.resize(found, model.lmax, run.sky.lmax))
 
 
 @lru_cache(maxsize=2)

@@ -1,8 +1,8 @@
 """Effects of free form: each is a stage of the simulation at which numbers that were found, not physics, act.
 
 A reconstruction writes a class derived from one of these, with its numbers as class variables. Its only parameter is
-``amplitude``: 1 as it was found, 0 absent. Patterns on the sky are real coefficients in the frame of the maps
-(:mod:`mcsim.sphere.real`).
+``amplitude``: 1 as it was found, 0 absent. Patterns on the sky are real coefficients (:mod:`mcsim.sphere.real`) in the
+frame of the maps that they were found in; maps that are made in another one see them turned.
 """
 
 from dataclasses import dataclass, replace
@@ -21,8 +21,9 @@ from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.reconstruction.sky_changes import raised, rotations
 from mcsim.reconstruction.sources import at, points
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import healpix, real
+from mcsim.sphere import healpix, real, rotation
 from mcsim.sphere.sky import dipole_alm
+from mcsim.support.arrays import Matrix
 from mcsim.systematics.base import Alm, Draw, Effect, Map, Site
 from mcsim.systematics.parametrization import Parametrization, Vector
 from mcsim.systematics.product import multiplied
@@ -43,7 +44,7 @@ class Form(Effect):
     Attributes
     ----------
     frame
-        Of the maps for which the numbers hold; None: any.
+        Of the maps that the numbers were found in; None: they are the same in any.
     """
 
     name: ClassVar[str] = "form"
@@ -56,13 +57,19 @@ class Form(Effect):
     parametrization = Parametrization(matched_filter=False)
     frame: ClassVar[str | None] = None
 
-    def check_frame(self, site: Site) -> None:
-        """Raise InputError for maps in another frame than that of the numbers."""
-        if self.frame is not None and site.frame != self.frame:
-            raise InputError(
-                f"effect {self.name} was reconstructed in the {self.frame} frame, but the maps are {site.frame}; "
-                f'simulate with map.frame = "{self.frame}".'
-            )
+    def frame_of(self, site: Site) -> str:
+        """Return the frame of the numbers: that of the maps if they are the same in any."""
+        return self.frame or site.frame
+
+    def turn(self, site: Site) -> Matrix:
+        """Return the rotation of directions from the frame of the numbers into that of the maps, shape (3, 3)."""
+        return rotation.rotation_matrix(self.frame_of(site), site.frame)
+
+    def pattern(self, values: tuple[float, ...], site: Site) -> Vector:
+        """Return the real coefficients of a pattern in the frame of the maps."""
+        degree = int(np.sqrt(len(values))) - 1
+        alm = rotation.rotate_alm(real.to_alm(np.array(values), degree), degree, self.frame_of(site), site.frame)
+        return real.coefficients(alm, degree, degree)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,9 +96,8 @@ class AddedPattern(ByFrequency):
     coefficients: ClassVar[tuple[float, ...]]
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        self.check_frame(site)
         factor = self.amplitude * self.seen(site)
-        return sky + factor * real.to_alm(np.array(self.coefficients), site.lmax)
+        return sky + factor * real.to_alm(self.pattern(self.coefficients, site), site.lmax)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,9 +109,9 @@ class CompactSource(ByFrequency):
     factor: ClassVar[float]
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        self.check_frame(site)
         factor = self.amplitude * self.factor * self.seen(site)
-        return sky + factor * at((self.lon_deg, self.lat_deg), site.lmax)
+        alm = at((self.lon_deg, self.lat_deg), site.lmax)
+        return sky + factor * rotation.rotate_alm(alm, site.lmax, self.frame_of(site), site.frame)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,11 +123,10 @@ class GainPattern(ByFrequency):
     on_dipole: ClassVar[bool] = True
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        self.check_frame(site)
         seen = sky if self.on_sky else np.zeros_like(sky)
         if self.on_dipole:
             seen = seen + dipole_alm(site.dipole_uk, site.lmax)
-        values, degree = np.array(self.coefficients), int(np.sqrt(len(self.coefficients))) - 1
+        values, degree = self.pattern(self.coefficients, site), int(np.sqrt(len(self.coefficients))) - 1
         product = multiplied(seen, site.lmax, lambda *n: real.field(values, *n), degree)
         return sky + self.amplitude * self.seen(site) * product
 
@@ -133,9 +138,8 @@ class RotatedSky(Form):
     rotation: ClassVar[tuple[float, float, float]]
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        self.check_frame(site)
-        whole = sky + dipole_alm(site.dipole_uk, site.lmax)
-        changes = (w * turned for w, turned in zip(self.rotation, rotations(whole, site.lmax), strict=True))
+        whole, axis = sky + dipole_alm(site.dipole_uk, site.lmax), self.turn(site) @ self.rotation
+        changes = (w * turned for w, turned in zip(axis, rotations(whole, site.lmax), strict=True))
         return sky + self.amplitude * sum(changes, start=np.zeros_like(sky))
 
 
@@ -147,8 +151,7 @@ class BoostedSky(Form):
     velocity: ClassVar[tuple[float, float, float]]
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
-        self.check_frame(site)
-        x, y, z = self.velocity
+        x, y, z = self.turn(site) @ self.velocity
         speed = self.amplitude * float(np.linalg.norm(self.velocity))
         return boosted(sky, site.lmax, speed, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x))
 
@@ -238,14 +241,13 @@ class InTime(Form):
         """Return constant, pattern or wave."""
         if not self.wave:
             return np.full(len(time_s), self.coefficients[0])
-        pointing = site.pointed(self.name)
-        self.check_frame(site)
+        pointing, frame = site.pointed(self.name), self.frame_of(site)
         if self.wave in ("sky", "Sun"):
-            beam, _ = line_of_sight(pointing, time_s, site.frame)
+            beam, _ = line_of_sight(pointing, time_s, frame)
             if self.wave == "Sun":
-                towards = (heading(pointing.model, time_s, site.frame, phase) for phase in (0.0, 0.5 * np.pi))
+                towards = (heading(pointing.model, time_s, frame, phase) for phase in (0.0, 0.5 * np.pi))
                 return np.array(self.coefficients) @ np.stack([np.sum(one * beam, axis=0) for one in towards])
-            return np.asarray(_maps_of(self.coefficients, (0,))[0][0][healpy.vec2pix(_NSIDE, *beam)])
+            return np.asarray(_maps_of(self.coefficients, (0,), frame, frame)[0][0][healpy.vec2pix(_NSIDE, *beam)])
         if self.wave == "trend":
             return self.coefficients[0] * (2.0 * time_s / (pointing.model.duration_days * SECONDS_PER_DAY) - 1.0)
         if self.wave == "spin":
@@ -255,7 +257,7 @@ class InTime(Form):
         elif self.wave == "period":
             phase = 2.0 * np.pi * time_s / self.period_s
         else:
-            phase = orientation(pointing, time_s, site.frame) if psi is None else psi
+            phase = psi if psi is not None and frame == site.frame else orientation(pointing, time_s, frame)
         found = np.zeros(len(time_s))
         for k, (cosine, sine) in enumerate(zip(self.coefficients[::2], self.coefficients[1::2], strict=True)):
             turned = (self.harmonic + k) * phase
@@ -275,9 +277,9 @@ class AddedToSamples(InTime, ByFrequency):
 
     def signal(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> Vector:
         if self.wave == "sky":
-            self.check_frame(site)
             pixel, value = healpy.ang2pix(_NSIDE, theta, phi), np.zeros(len(theta))
-            for s, (q, u) in zip(self.spins, _maps_of(self.coefficients, self.spins), strict=True):
+            maps = _maps_of(self.coefficients, self.spins, self.frame_of(site), site.frame)
+            for s, (q, u) in zip(self.spins, maps, strict=True):
                 value += np.cos(s * psi) * q[pixel] + np.sin(s * psi) * u[pixel]
         elif self.wave == "lobe":
             outward, south, east = axes(theta, phi)
@@ -361,8 +363,7 @@ class NoisePattern(Form):
         """Return one plus the pattern, at least zero."""
         if self.amplitude == 0.0:
             return None
-        self.check_frame(site)
-        pattern = real.field(np.array(self.coefficients), *healpix.centres(site.nside))
+        pattern = real.field(self.pattern(self.coefficients, site), *healpix.centres(site.nside))
         return np.maximum(1.0 + self.amplitude * pattern, 0.0)
 
 
@@ -375,15 +376,18 @@ def steps(edges: tuple[int, ...], values: tuple[complex, ...], lmax: int) -> NDA
 
 
 @lru_cache(maxsize=4)
-def _maps_of(coefficients: tuple[float, ...], spins: tuple[int, ...]) -> list[NDArray[np.float64]]:
-    """Return Q and U of patterns of every spin, shape (2, npix) each; of spin 0 the map, and zero."""
+def _maps_of(
+    coefficients: tuple[float, ...], spins: tuple[int, ...], frame_from: str, frame_to: str
+) -> list[NDArray[np.float64]]:
+    """Return Q and U of patterns of every spin in another frame, shape (2, npix) each; of spin 0 the map, and zero."""
     fields = sum(2 if s else 1 for s in spins)
     top = round(np.sqrt((len(coefficients) + sum(2 * s**2 for s in spins)) / fields)) - 1
     rest, found = np.array(coefficients), []
     for s in spins:
         count = (top + 1) ** 2 - s**2
         each, rest = np.split(rest, [2 * count if s else count])
-        alms = np.stack([real.to_alm(np.append(np.zeros(s**2), one), top) for one in each.reshape(-1, count)])
+        rows = (real.to_alm(np.append(np.zeros(s**2), one), top) for one in each.reshape(-1, count))
+        alms = np.stack([rotation.rotate_alm(one, top, frame_from, frame_to) for one in rows])
         made = healpix.synthesis(alms, _NSIDE, top, spin=s)
         found.append(made if s else np.stack([made[0], np.zeros_like(made[0])]))
     return found

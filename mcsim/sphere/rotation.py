@@ -67,7 +67,8 @@ def _frame_D(L: int, frame_from: str, frame_to: str) -> NDArray[np.complex128]:
 def rotate_alm(alm: Alm, lmax: int, frame_from: str, frame_to: str, nthreads: int = 1) -> Alm:
     """Return the a_lm of a real field, shape (size(lmax),), in another frame; InputError for another shape."""
     check_alm(alm, lmax)
-    return turn_alm(alm, lmax, rotation_matrix(frame_from, frame_to), nthreads)
+    matrix = rotation_matrix(frame_from, frame_to)
+    return alm.copy() if frame_from == frame_to else turn_alm(alm, lmax, matrix, nthreads)
 
 
 def turn_alm(alm: Alm, lmax: int, matrix: Matrix, nthreads: int = 1) -> Alm:

@@ -1,0 +1,107 @@
+"""Maps that a preparation turns into another frame: what is found in them acts on maps as they are made."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from instruments import two_channels
+from mcsim import config
+from mcsim.bipolar import power_spectrum
+from mcsim.datavector.analysis import analysis_of, simulated_maps
+from mcsim.datavector.campaign import constrained_jobs
+from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.wiener_filter import shared_sky
+from mcsim.reconstruction.plugin import Plugin
+from mcsim.simulation import simulate
+from mcsim.simulation.survey import survey
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import healpix, real
+from mcsim.sphere.rotation import rotate_alm, rotation_matrix
+from mcsim.systematics import spacecraft
+
+LMAX = 20
+FRAMES = ("ecliptic", "galactic")
+RANDOM = tuple(np.random.default_rng(3).normal(size=18))
+
+
+@lru_cache(maxsize=2)
+def site(frame):
+    """The place in the simulation of V1 in maps of a frame."""
+    run = two_channels("turned", lmax=LMAX, nside=16, period_s=997.0)
+    return survey(config.load({**run, "map": {**run["map"], "frame": frame}})).channels[0].site
+
+
+def acting(base, **values):
+    """Return the effect of numbers that were found in galactic maps."""
+    return Plugin("unlisted_1", base, "V1", {"frame": "galactic", **values}).kind()(amplitude=1.0)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        acting("AddedPattern", coefficients=RANDOM[:9]),
+        acting("CompactSource", lon_deg=40.0, lat_deg=-25.0, factor=2.0),
+        acting("GainPattern", coefficients=RANDOM[:9]),
+        acting("RotatedSky", rotation=RANDOM[:3]),
+        acting("BoostedSky", velocity=(0.02, -0.03, 0.01)),
+    ],
+    ids=lambda effect: type(effect).__mro__[1].__name__,
+)
+def test_what_acts_on_the_sky_is_the_same_in_maps_of_another_frame(effect):
+    draw = np.random.default_rng(5).normal(size=(2, alm_.size(LMAX)))
+    sky = draw[0] + 1j * np.where(np.arange(draw.shape[1]) > LMAX, draw[1], 0.0)
+    turned = rotate_alm(sky, LMAX, *FRAMES)
+    there, here = effect.sky(turned, site("galactic"), None), effect.sky(sky, site("ecliptic"), None)
+    changed = np.abs(there - turned).max()
+    np.testing.assert_allclose(rotate_alm(here, LMAX, *FRAMES), there, rtol=0, atol=1e-6 * changed)
+
+
+def test_noise_that_grows_by_a_pattern_is_the_same_in_maps_of_another_frame():
+    pattern = 0.02 * np.array(RANDOM[:9])
+    found = acting("NoisePattern", coefficients=tuple(pattern)).noise(site("ecliptic"))
+    there = rotation_matrix(*FRAMES) @ healpix.centres(16)
+    np.testing.assert_allclose(found, 1.0 + real.field(pattern, *there), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        acting("AddedToSamples", wave="sky", coefficients=RANDOM[:4]),
+        acting("AddedToSamples", wave="sky", spins=(1,), coefficients=RANDOM[:6]),
+        acting("AddedToSamples", wave="sky", spins=(2,), coefficients=RANDOM[:10]),
+        acting("AddedToSamples", wave="orientation", harmonic=2, coefficients=RANDOM[:2]),
+        acting("GainOverTime", wave="sky", coefficients=RANDOM[:4]),
+        acting("GainOverTime", wave="orientation", harmonic=1, coefficients=RANDOM[:2]),
+        acting("GainOfOne", wave="orientation", harmonic=1, coefficients=RANDOM[:2], on_sky=False),
+    ],
+    ids=lambda effect: f"{type(effect).__mro__[1].__name__}-{effect.wave}",
+)
+def test_what_acts_on_samples_is_the_same_in_maps_of_another_frame(effect):
+    """Patterns are those of the centres of pixels of 27', and at the poles psi changes within a pixel."""
+    time_s, found = np.linspace(0.0, 3e7, 500), []
+    for frame in FRAMES:
+        where, pointing = site(frame), site(frame).pointing
+        (x, y, z), _ = spacecraft.line_of_sight(pointing, time_s, frame)
+        theta, phi = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
+        psi = spacecraft.orientation(pointing, time_s, frame)
+        gain = effect.gain(time_s, where) if type(effect).__mro__[1].__name__ == "GainOverTime" else None
+        found.append(effect.signal(time_s, theta, phi, psi, where) if gain is None else gain)
+    there = found[1]
+    assert np.std(there) > 0.0
+    assert np.quantile(np.abs(found[0] - there), 0.9) < 0.05 * np.std(there)
+
+
+def test_skies_that_turned_maps_constrain_are_these_skies():
+    """Nothing but noise tells the filtered sky of such maps from that of the observed ones."""
+    table = two_channels("turned", lmax=LMAX, nside=16)
+    table["preparation"] = [{"kind": "rotate", "frame": "galactic"}]
+    analysis = analysis_of(config.load(table), settings=DiagnosisSettings(hidden_share=1.0))
+    model = analysis.model
+    assert model.frame == "galactic"
+    observed = shared_sky(model, list(simulate.maps(model.survey, 5)))
+    (maps,) = simulated_maps(constrained_jobs(analysis, (), observed, range(1))[0])
+    apart = shared_sky(model, maps) - observed
+    ell = np.arange(2, 11)  # where the sky is far above the noise
+    left, power = (power_spectrum(one, one, LMAX)[ell] for one in (apart, observed))
+    assert np.all(left < 0.1 * power)
