@@ -14,6 +14,7 @@ from mcsim.datavector.candidate import columns_of, parts_of, scatters_of, tables
 from mcsim.datavector.halves import Halves
 from mcsim.datavector.nuisances import with_priors
 from mcsim.diagnosis.assemble import result_of
+from mcsim.diagnosis.bent import bent_templates
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import as_seen
 from mcsim.diagnosis.naming import agreeing, unconfirmed
@@ -33,7 +34,9 @@ from mcsim.support.numbers import measured
 
 def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     """Diagnose observed maps or measured spectra; raise InputError if they cannot be what they claim to be."""
-    refined = Refiner(data).run(data.templates(), data.context.candidates)
+    context, t = data.context, data.templates()
+    start = bent_templates(context.null, data.x, t, context.bank.curvature, context.candidates)
+    refined = Refiner(data).run(t, context.candidates, start=start)
     found, reduction = refined.attribution.if_named(data.context.settings), None
     exchanged = data.exchanged(found)
     notes, refusals = [*exchanged, *data.notes()], list[str]()

@@ -55,8 +55,16 @@ class Refiner:
         """Return the model, its simulations and templates."""
         return self.data.context
 
-    def run(self, t: Matrix, candidates: Sequence[Candidate], sets: Sequence[tuple[int, ...]] = ()) -> Refined:
+    def run(
+        self,
+        t: Matrix,
+        candidates: Sequence[Candidate],
+        sets: Sequence[tuple[int, ...]] = (),
+        start: Matrix | None = None,
+    ) -> Refined:
         """Refine templates ``t``, shape (p, K), and the attribution; of ``sets`` all members, named or not.
+
+        The first attribution is by the templates ``start``, shape (p, K); by default ``t``.
 
         Notes
         -----
@@ -69,7 +77,8 @@ class Refiner:
         set of effects that are alike. Members of the best sets are always simulated, and what is like them where its
         templates may be why it fits worse. A faint gap has the odds of the first templates at most.
         """
-        now = _Responses(t, t.copy(), list(candidates))
+        start = t if start is None else start
+        now = _Responses(t, start.copy(), list(candidates))
         first = found = self._attribute(now.t, now.candidates)
         for _ in range(self.context.settings.refine_rounds):
             tried = [self._simulate(now, *part, curved=True) for part in self._of_sets(now, sets)]
@@ -79,13 +88,13 @@ class Refiner:
             found = self._attribute(now.t, now.candidates)
         now, found = self._with_smaller(now, self._completed(now, found))
         for index in self._displaced(now, first, found):
-            alone = self._alone(now, t, index)
+            alone = self._alone(now, start, index)
             own = self._completed(alone, self._attribute(alone.t, alone.candidates))
             if (index,) in [one.members for one in own.explanations]:
                 now, found = alone, own
         scattered = [i for i, one in enumerate(now.candidates) if one.scatter is not None]
         for index in scattered if all(len(one.members) > 1 for one in found.explanations) else []:
-            alone = self._alone(now, t, index)
+            alone = self._alone(now, start, index)
             own = self._attribute(alone.t, alone.candidates)
             if (index,) in [one.members for one in own.explanations]:
                 now, found = alone, own
@@ -236,7 +245,7 @@ class Refiner:
         return True
 
     def _displaced(self, now: "_Responses", first: Attribution, found: Attribution) -> list[int]:
-        """Return candidates that explain less alone than by their linear responses, and were simulated elsewhere.
+        """Return candidates that explain less alone than by their first templates, and were simulated elsewhere.
 
         In a set the amplitudes of effects that are alike can be large and of opposite signs. A response that was
         simulated there says nothing of the amplitude that the effect has alone, to which no other set may lead back.
@@ -249,12 +258,12 @@ class Refiner:
             and not has_settled(self.context.settings, done, alone.amplitudes, alone.covariance)
         ]
 
-    def _alone(self, now: "_Responses", linear: Matrix, index: int) -> "_Responses":
-        """Return the responses with a candidate at the amplitude that it has alone, from its linear one."""
+    def _alone(self, now: "_Responses", start: Matrix, index: int) -> "_Responses":
+        """Return the responses with a candidate at the amplitude that it has alone, by its first templates at first."""
         null, columns = self.context.null, list(now.candidates[index].columns)
         done = {other: at for other, at in now.done.items() if other != index}
-        now = _Responses(linear, now.t.copy(), [*now.candidates], done)
-        now.t[:, columns] = linear[:, columns]
+        now = _Responses(now.linear, now.t.copy(), [*now.candidates], done)
+        now.t[:, columns] = start[:, columns]
         now.candidates[index] = replace(now.candidates[index], scatter=None)
         for _ in range(self.context.settings.refine_rounds):
             wide = null.with_extra_covariance(*scatters_of(now.candidates, [index]))

@@ -1,0 +1,53 @@
+"""Templates of effects whose response to data is more bent than straight: those of a parabola where it fits best."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from mcsim.datavector.candidate import Candidate
+from mcsim.diagnosis.partial import beyond
+from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.support.arrays import Matrix, Vector
+
+
+def bent_templates(
+    null: SimulatedGaussian, x: Vector, t: Matrix, curvature: Matrix, candidates: Sequence[Candidate]
+) -> Matrix:
+    """Return templates ``t``, shape (p, K), of which some are secants of parabolas, exact where these fit data best.
+
+    ``curvature``, shape (p, K), has half the second derivatives in each coordinate. Secants are those of candidates
+    whose straight response fits at coordinates where the bent part is larger than itself. Elements that are squares of
+    maps then hold most of what a strong effect does, and a straight fit to these says nothing of its amplitude.
+    """
+    bent, y = t.copy(), null.whiten(x)
+    for candidate in candidates:
+        if candidate.parametrization.stochastic or candidate.nuisance:
+            continue
+        columns = list(candidate.columns)
+        straight, square = (null.whiten_templates(one[:, columns]) for one in (t, curvature))
+        first = np.asarray(np.linalg.lstsq(straight, y, rcond=None)[0], dtype=np.float64)
+        if np.linalg.norm(square @ first**2) <= np.linalg.norm(straight @ first):
+            continue
+        best = _fit(y, straight, square, first)
+        covariance = np.asarray(np.linalg.pinv(straight.T @ straight), dtype=np.float64)
+        if best is None or not np.isfinite(candidate.beyond(best, covariance)):
+            continue
+        response = t[:, columns] @ best + curvature[:, columns] @ best**2
+        bent[:, columns] += beyond(null, t[:, columns], best, response)
+    return bent
+
+
+def _fit(y: Vector, straight: Matrix, square: Matrix, first: Vector) -> Vector | None:
+    """Return the coordinates at which parabolas fit best; None if no better than the straight response.
+
+    The descent starts at the straight fit, and at that of what the bent parts, with any size, leave of the data.
+    """
+    without = np.linalg.lstsq(np.hstack([straight, square]), y, rcond=None)[0][: first.size]
+    found = [
+        least_squares(lambda at: straight @ at + square @ at**2 - y, start, jac=lambda at: straight + 2.0 * square * at)
+        for start in (first, without)
+    ]
+    best = min(found, key=lambda one: float(one.cost))
+    better = 2.0 * best.cost < float(np.sum((y - straight @ first) ** 2))
+    return np.asarray(best.x) if better else None

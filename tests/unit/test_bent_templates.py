@@ -1,0 +1,66 @@
+"""A strong effect whose response is more bent than straight is looked for where a parabola fits the data."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from mcsim.datavector.candidate import Candidate
+from mcsim.diagnosis.bent import bent_templates
+from mcsim.stats.gaussian import SimulatedGaussian
+from mcsim.systematics import Effect, Parametrization
+
+P = 40
+RNG = np.random.default_rng(17)
+NULL = SimulatedGaussian.from_simulations(RNG.normal(size=(800, P)))
+ALONG, BESIDE, OTHER, SQUARE, *_ = np.linalg.qr(RNG.normal(size=(P, 4)))[0].T
+T = np.stack([ALONG, BESIDE, OTHER], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vector(Effect):
+    """A vector of two components, and all its power in the squares of the data."""
+
+    name = "vector"
+    scope = "channel"
+    unit = "uK"
+    cause = signature = ""
+    step = 1.0
+    parametrization = Parametrization(max_amplitude=50.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn(Vector):
+    parametrization = Parametrization(stochastic=True)
+
+
+def bent(x, bend, kind=Vector):
+    """Templates of a vector, and of another effect, whose response is straight."""
+    curvature = np.outer(bend * (SQUARE + 0.3 * BESIDE), [1.0, 1.0, 0.0])
+    return bent_templates(NULL, x, T, curvature, (Candidate(kind, "A", (0, 1)), Candidate(Vector, "B", (2,))))
+
+
+def response(at, bend):
+    return T[:, :2] @ at + bend * (SQUARE + 0.3 * BESIDE) * (at @ at)
+
+
+@pytest.mark.parametrize("at", [(8.0, -5.0), (-3.0, 9.0), (-20.0, -20.0)])
+def test_the_secant_is_that_of_the_true_amplitude(at):
+    at, bend = np.array(at), 2.0
+    x = response(at, bend) + RNG.normal(size=P)
+    straight = NULL.fit(x, T[:, :2])
+    assert np.abs(straight.amplitudes - at).max() > 20.0  # the square has most of it
+    found = bent(x, bend)
+    np.testing.assert_allclose(found[:, :2] @ at, response(at, bend), rtol=0, atol=0.02 * np.linalg.norm(x))
+    np.testing.assert_allclose(NULL.fit(x, found[:, :2]).amplitudes, at, rtol=0, atol=2.0)
+    np.testing.assert_array_equal(found[:, 2], T[:, 2])
+
+
+@pytest.mark.parametrize(
+    ("at", "bend", "kind"),
+    [((8.0, -5.0), 0.02, Vector), ((8.0, -5.0), 2.0, Drawn), ((60.0, 0.0), 2.0, Vector), ((0.0, 0.0), 2.0, Vector)],
+    ids=["hardly bent", "drawn", "impossible", "absent"],
+)
+def test_other_templates_stay(at, bend, kind):
+    x = response(np.array(at), bend)
+    np.testing.assert_array_equal(bent(x, bend, kind), T)
