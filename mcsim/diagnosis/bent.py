@@ -9,6 +9,7 @@ from mcsim.datavector.candidate import Candidate
 from mcsim.diagnosis.partial import beyond
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
+from mcsim.systematics import acts_through
 
 
 def bent_templates(
@@ -19,10 +20,13 @@ def bent_templates(
     ``curvature``, shape (p, K), has half the second derivatives in each coordinate. Secants are those of candidates
     whose straight response fits at coordinates where the bent part is larger than itself. Elements that are squares of
     maps then hold most of what a strong effect does, and a straight fit to these says nothing of its amplitude.
+    Parabolas hold for what changes maps in proportion to the coordinates, as additions and gains do and beams do not.
     """
     bent, y = t.copy(), null.whiten(x)
     for candidate in candidates:
-        if candidate.parametrization.stochastic or candidate.nuisance:
+        how = candidate.parametrization
+        in_proportion = how.proportional or acts_through(candidate.effect, "sky", "signal", "gain")
+        if how.stochastic or candidate.nuisance or not in_proportion:
             continue
         columns = list(candidate.columns)
         straight, square = (null.whiten_templates(one[:, columns]) for one in (t, curvature))

@@ -162,7 +162,10 @@ class Refiner:
         they fit worse by.
         """
         tolerated = one.fit.pvalue <= self.context.settings.residual_level
-        cosine = cosines(self.context.null.whiten_groups(now.linear, [own.columns for own in now.candidates]))
+        # In an observed sky that has a strong effect of its own, responses are less alike than in others.
+        groups = [own.columns for own in now.candidates]
+        each = [cosines(self.context.null.whiten_groups(t, groups)) for t in (now.linear, self.context.templates)]
+        cosine = np.maximum(*each)
         found: dict[int, tuple[int, ...]] = {}
         for member in one.members:
             others = tuple(other for other in one.members if other != member)

@@ -269,7 +269,7 @@ class BeamSidelobe(Effect):
         Bound("radius_sigmas", 0.0, 20.0, "a ring around the main beam, by definition; fixed in a fit"),
         Bound("width_sigmas", 0.5, 20.0, "narrower rings are none that the beam's coefficients hold; fixed in a fit"),
     )
-    parametrization = _RoundAndQuadrupole()
+    parametrization = _RoundAndQuadrupole(proportional=True)
     setting_words: ClassVar[Mapping[str, str]] = {
         "calibrated = none": "calibrated on its peak",
         "calibrated = dipole": "calibrated on the dipole",

@@ -9,7 +9,7 @@ from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.sphere.sky import dipole_alm
 from mcsim.systematics.base import Alm, Bound, Draw, Effect, Site, Wording
-from mcsim.systematics.parametrization import Angle, Vector, reciprocal
+from mcsim.systematics.parametrization import Angle, Parametrization, Vector, reciprocal
 from mcsim.systematics.product import multiplied
 from mcsim.systematics.spacecraft import spin_phase
 
@@ -33,6 +33,7 @@ class Calibration(Effect):
     signature = "L = 0 and the dipole: the same factor at all degrees and times, in this channel alone."
     source = "Jarosik et al. 2011, ApJS 192, 14 (0.2 %); Planck 2015 results V, A&A 594, A5"
     step = 1e-3
+    parametrization = Parametrization(proportional=True)
     bounds = (Bound("amplitude", -0.5, 0.5, "a prior of this library: half of the dipole is seen by eye"),)
 
     def beam(self, beam: Beam, site: Site) -> Beam:

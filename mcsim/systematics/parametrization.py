@@ -36,6 +36,8 @@ class Parametrization:
     #: dipoles, variances, spectra and modulations, which are always measured, contain all of it
     matched_filter: bool = True
     nonlinear: bool = False  #: True if the response is simulated anew at whatever amplitude is fitted
+    #: True if a hook on the beam changes it in proportion to the coordinates, as what is added and gains change maps
+    proportional: bool = False
 
     @property
     def measured(self) -> tuple[str, ...]:

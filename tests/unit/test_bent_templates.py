@@ -28,6 +28,23 @@ class Vector(Effect):
     step = 1.0
     parametrization = Parametrization(max_amplitude=50.0)
 
+    def sky(self, sky, site, draw):
+        return sky
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfTheBeam(Effect):
+    """The maps of which are in no proportion to its size."""
+
+    name = "of_the_beam"
+    scope = "channel"
+    unit = "uK"
+    cause = signature = ""
+    step = 1.0
+
+    def beam(self, beam, site):
+        return beam
+
 
 @dataclass(frozen=True, kw_only=True)
 class Drawn(Vector):
@@ -58,8 +75,14 @@ def test_the_secant_is_that_of_the_true_amplitude(at):
 
 @pytest.mark.parametrize(
     ("at", "bend", "kind"),
-    [((8.0, -5.0), 0.02, Vector), ((8.0, -5.0), 2.0, Drawn), ((60.0, 0.0), 2.0, Vector), ((0.0, 0.0), 2.0, Vector)],
-    ids=["hardly bent", "drawn", "impossible", "absent"],
+    [
+        ((8.0, -5.0), 0.02, Vector),
+        ((8.0, -5.0), 2.0, Drawn),
+        ((8.0, -5.0), 2.0, OfTheBeam),
+        ((60.0, 0.0), 2.0, Vector),
+        ((0.0, 0.0), 2.0, Vector),
+    ],
+    ids=["hardly bent", "drawn", "of the beam", "impossible", "absent"],
 )
 def test_other_templates_stay(at, bend, kind):
     x = response(np.array(at), bend)

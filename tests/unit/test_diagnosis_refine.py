@@ -78,7 +78,9 @@ class Instrument:
 
     def refined(self, x: np.ndarray, sets=()):
         bank = SimpleNamespace(curvature=self.curvature)
-        context = SimpleNamespace(null=self.null, calibration=self.calibration, bank=bank, settings=self.settings)
+        context = SimpleNamespace(
+            null=self.null, templates=self.t, calibration=self.calibration, bank=bank, settings=self.settings
+        )
         own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter, "rescaled": lambda tables: False}
         own["dipole_snr"] = lambda tables: float(tables[0].channel in self.crossed)
         groups = self.null.whiten_groups(self.t, [one.columns for one in self.candidates])
