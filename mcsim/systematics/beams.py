@@ -227,6 +227,10 @@ class _RoundAndQuadrupole(Parametrization):
     def coordinates(self, effect: Any) -> Vector:
         return np.array([1.0 - effect.quadrupole, effect.quadrupole]) * effect.amplitude
 
+    def typical(self, effect: Any) -> NDArray[np.float64]:
+        """Return the ring that the effect is by default, a round one: its quadrupole is seen earlier."""
+        return np.array([[1.0], [0.0]])
+
     def nearest(self, coordinates: Vector, precision: NDArray[np.float64]) -> dict[str, Any]:
         """Return a, the sum of both, and q, the share of the second."""
         amplitude = float(coordinates.sum())

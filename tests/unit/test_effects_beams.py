@@ -343,3 +343,10 @@ def test_a_negative_ellipticity_is_said_as_the_beam_that_it_makes():
     same(turned.beam(beam, site_of(beam)), same_beam.beam(beam, site_of(beam)), 1e-12)
     assert same_beam.describe() == "axis ratio 1.25 with the major axis across the scan"
     assert turned.describe() == "axis ratio 1.25 (turned by 90°) with the major axis across the scan"
+
+
+def test_a_detectable_ring_is_the_one_that_the_effect_is_by_default():
+    ring = systematics.catalogue()["beam_sidelobe"]
+    fit = ring.parametrization
+    np.testing.assert_array_equal(fit.typical(ring())[:, 0], fit.coordinates(ring(amplitude=1.0)))
+    assert fit.typical(ring()).shape == (len(fit.basis()), 1)
