@@ -18,7 +18,7 @@ from mcsim.errors import InputError
 from mcsim.stats.detection import detectable, snr_needed, snr_to_separate
 from mcsim.stats.excess import HeldOut, excess_of
 from mcsim.stats.gaussian import Fit
-from mcsim.support.arrays import Vector
+from mcsim.support.arrays import Matrix, Vector
 
 TELLING = 12  #: elements that are named where two sets differ
 
@@ -152,7 +152,9 @@ def _sigma(candidate: Candidate, theta: Vector, covariance: Vector, parameter: s
 
     A step of one error moves also a value at the edge of what is possible. What the data do not constrain is not
     varied. The error of an amplitude to which coordinates are proportional is at least that with all else fixed, and
-    just that where bounds fix the rest.
+    just that where bounds fix the rest. A vector of which one component is hardly known, as a dipole along that of the
+    sky is beside an uncertain calibration, is fitted across it, where this component has no slope: its error is at
+    least by how much all vectors that may be are longer on average.
     """
     how = candidate.parametrization
     scale, slopes = np.sqrt(np.diag(covariance)), np.zeros(len(theta))
@@ -165,8 +167,23 @@ def _sigma(candidate: Candidate, theta: Vector, covariance: Vector, parameter: s
     inside, variance = candidate.fitted(theta, covariance), max(float(slopes @ covariance @ slopes), 0.0)
     unit = how.coordinates(replace(inside, amplitude=1.0))
     if parameter == "amplitude" and not how.nonlinear and (known := float(unit @ precision @ unit)) > 0.0:
-        variance = max(variance * (inside == candidate.with_coordinates(constrained, precision)), 1.0 / known)
+        free = candidate.with_coordinates(constrained, precision)
+        longer = _longer(candidate, constrained, covariance) if inside == free else 0.0
+        variance = max(variance * (inside == free), 1.0 / known, longer**2)
     return float(np.sqrt(variance))
+
+
+def _longer(candidate: Candidate, theta: Vector, covariance: Matrix) -> float:
+    """Return by how much the amplitude grows on average when coordinates move by their errors, either way."""
+    if np.count_nonzero(theta) < len(theta):
+        return 0.0
+    errors, axes = np.linalg.eigh(covariance)
+    precision = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
+    here, more = abs(candidate.with_coordinates(theta, precision).amplitude), 0.0
+    for step in (axes * np.sqrt(np.maximum(errors, 0.0))).T:
+        there = (abs(candidate.with_coordinates(one, precision).amplitude) for one in (theta + step, theta - step))
+        more += 0.5 * sum(there) - here
+    return max(more, 0.0)
 
 
 def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[CandidateResult]:

@@ -47,6 +47,16 @@ def test_an_error_where_a_bound_fixes_a_parameter_is_that_along_the_bound() -> N
     assert found.sigma == pytest.approx(float(unit @ np.linalg.solve(covariance, unit)) ** -0.5, rel=1e-9)
 
 
+def test_a_dipole_of_which_one_component_is_hardly_known_has_that_in_its_error() -> None:
+    """Beside an uncertain calibration it is fitted across that of the sky: 11.8 uK along it were 3.2 +- 1.4 uK."""
+    candidate, _ = candidate_of("dipole_residual")
+    for hardly, sigma in ((1.4, 1.4), (8.5, (3.2**2 + 8.5**2) ** 0.5 + (3.2**2 + 1.4**2) ** 0.5 - 2.0 * 3.2)):
+        found_at = Fit(np.array([3.2, 1e-9, 1e-9]), np.diag([1.4, hardly, 1.4]) ** 2, 1000, 100.0, 1.0, 0.0, 1, 1.0)
+        [found] = effects_of([candidate], [0], found_at)
+        assert found.amplitude == pytest.approx(3.2)
+        assert found.sigma == pytest.approx(sigma, rel=1e-6)
+
+
 def test_the_error_of_a_whole_number_is_in_its_own_unit() -> None:
     """Coordinates of a map-making that stops early are 1.5^n - 1, not n times those of one iteration."""
     effect = systematics.get("mapmaking_convergence")

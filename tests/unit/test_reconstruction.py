@@ -318,18 +318,6 @@ def test_orientations_are_those_of_the_pointing():
         np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * expected), atol=1e-7)
 
 
-@pytest.mark.parametrize("stage", ["added", "gain"])
-def test_what_follows_the_orientation_holds_in_one_frame(stage):
-    """The orientation is counted from the meridian of the maps: the same numbers are another signal in other maps."""
-    structure = next(w for w in grammar() if (w.stage, w.kind, w.channel) == (stage, "orientation 1", "W1"))
-    effect = plugin("unlisted_1", structure, np.ones(2), seen()[1]).kind()(amplitude=1.0)
-    site, times = survey(seen()[0]).channels[1].site, np.linspace(0.0, 3e7, 50)
-    act = effect.gain if stage == "gain" else lambda time_s, where: effect.signal(time_s, *(3 * [time_s]), where)
-    assert np.std(act(times, site)) > 0.5
-    with refused("ecliptic", "galactic"):
-        act(times, replace(site, frame="galactic"))
-
-
 def test_a_period_that_stands_out_is_searched(monkeypatch):
     """A wave in the samples of one channel adds its period to the words; maps of the model add none."""
     run, scene, _, _ = seen()
