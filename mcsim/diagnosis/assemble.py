@@ -174,7 +174,10 @@ def _sigma(candidate: Candidate, theta: Vector, covariance: Vector, parameter: s
 
 
 def _longer(candidate: Candidate, theta: Vector, covariance: Matrix) -> float:
-    """Return by how much the amplitude grows on average when coordinates move by their errors, either way."""
+    """Return by how much the amplitude grows on average when coordinates move by their errors, either way.
+
+    0 if some coordinates are not constrained: these are not varied.
+    """
     if np.count_nonzero(theta) < len(theta):
         return 0.0
     errors, axes = np.linalg.eigh(covariance)

@@ -18,8 +18,8 @@ T = np.stack([ALONG, BESIDE, OTHER], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Vector(Effect):
-    """A vector of two components, and all its power in the squares of the data."""
+class OfTheBeam(Effect):
+    """A vector of two components, all its power in the squares of the data, to which maps are in no proportion."""
 
     name = "vector"
     scope = "channel"
@@ -28,22 +28,16 @@ class Vector(Effect):
     step = 1.0
     parametrization = Parametrization(max_amplitude=50.0)
 
-    def sky(self, sky, site, draw):
-        return sky
+    def beam(self, beam, site):
+        return beam
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfTheBeam(Effect):
-    """The maps of which are in no proportion to its size."""
+class Vector(OfTheBeam):
+    """The same, added to the sky."""
 
-    name = "of_the_beam"
-    scope = "channel"
-    unit = "uK"
-    cause = signature = ""
-    step = 1.0
-
-    def beam(self, beam, site):
-        return beam
+    def sky(self, sky, site, draw):
+        return sky
 
 
 @dataclass(frozen=True, kw_only=True)
