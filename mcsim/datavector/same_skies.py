@@ -210,9 +210,9 @@ class SameSkies:
         jobs = [job for one in sets for job in self._jobs(*one, there=one[0])]
         self._ahead.update(zip(map(_key, jobs), self.ask(jobs) if jobs else [], strict=True))
 
-    def of_reference(self, found: Sequence[config.Effect], skies: int | None = None) -> Matrix:
-        """Return data vectors with effects, of the first or all of the skies with which responses are measured."""
-        return self._simulated(self._jobs(found, False, skies))
+    def of_reference(self, found: Sequence[config.Effect]) -> Matrix:
+        """Return data vectors with effects, of the skies with which responses are measured."""
+        return self._simulated(self._jobs(found, False, None))
 
     def pair(self, found: Sequence[config.Effect], skies: int, constrained: bool) -> tuple[Matrix, Matrix]:
         """Return data vectors of the same skies without effects and with them, which the observed maps have too."""

@@ -92,12 +92,10 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         yield from super().responses(candidates, skies)
 
     def pair(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix]:
-        """Return data vectors of the same skies without effects and with them; for noise alone of typical skies."""
+        """Return data vectors of the same skies without effects and with them; for noise alone of all of reference."""
         size, skies, library = len(self.x), self.context.settings.constrained_skies, dict(self.context.analysis.library)
-        if all(library[effect.name].parametrization.noise_alone for effect in found):
-            before = self.context.reference(found)[:skies]
-            after = self.same_skies.of_reference(found, len(before))
-        elif any(self.same_skies.skies_of(effect) == "reference" for effect in found):
+        noise = all(library[effect.name].parametrization.noise_alone for effect in found)
+        if noise or any(self.same_skies.skies_of(effect) == "reference" for effect in found):
             before, after = self.of_reference(found)
         else:
             before, after = self.same_skies.pair(found, skies, True)

@@ -161,11 +161,15 @@ class Subsets:
         parts = part / self._beside.size[subsets]
         scatter = np.sum(self._beside.chi2[subsets] * parts, axis=1)
         spread = np.sum(self._beside.spread[subsets] * parts**2, axis=1)
+        left = self.total - delta_chi2
+        evidence = log_evidence(null, self.total, delta_chi2, K, self.settings.prior_snr)
+        wide = scatter > 0.0
+        evidence[wide] += null.log_odds_of_scatter(left[wide], K, scatter[wide], spread[wide])
         prior = special.gammaln(size + 1) - size * np.log(len(self.candidates))
         return Solved(
-            chi2=self.total - delta_chi2,
-            pvalue=null.residual_test(self.total - delta_chi2, K, allowance + scatter, spread),
-            evidence=log_evidence(null, self.total, delta_chi2, K, self.settings.prior_snr) + prior,
+            chi2=left,
+            pvalue=null.residual_test(left, K, allowance + scatter, spread),
+            evidence=evidence + prior,
             allowance=allowance,
             parts=np.minimum(parts, 1.0),
         )

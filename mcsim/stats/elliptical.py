@@ -69,14 +69,31 @@ def f_tail(
     t (Muirhead, Aspects of Multivariate Statistical Theory, 1982, section 1.5). Tests:
     tests/statistical/test_elliptical.py.
     """
-    d1, d2, extra = np.asarray(d1, dtype=float), np.asarray(d2, dtype=float), np.asarray(noncentrality, dtype=float)
+    first, second, x = _central(f, d1, d2, noncentrality, scale, spread)
+    return np.asarray(special.fdtrc(first, second, x))
+
+
+def f_log_density(
+    f: ArrayLike, d1: ArrayLike, d2: ArrayLike, noncentrality: ArrayLike = 0.0, spread: ArrayLike = 0.0
+) -> NDArray[np.float64]:
+    """Return the logarithm of the density of log f; arguments are those of :func:`f_tail`, without a scale."""
+    a, b, x = _central(f, d1, d2, noncentrality, 0.0, spread)
+    a, b, x = a / 2.0, b / 2.0, np.maximum(a * x / b, 1e-300)
+    return np.asarray(a * np.log(x) - (a + b) * np.log1p(x) - special.betaln(a, b))
+
+
+def _central(
+    f: ArrayLike, d1: ArrayLike, d2: ArrayLike, noncentrality: ArrayLike, scale: float, spread: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the degrees of freedom of a central F distribution, and its variable in place of f."""
+    d1, second, extra = (np.asarray(one, dtype=float) for one in (d1, d2, noncentrality))
     half = d1 + 2.0 * extra + np.asarray(spread, dtype=float)
     first = (d1 + extra) ** 2 / half
     x = np.maximum(np.asarray(f, dtype=float), 0.0) * d1 / (d1 + extra)
     if scale > 0.0:
         # Of Fisher's F the relative variance is 2 (d1 + d2 - 2)/(d1 (d2 - 4)).
         more = 1.0 + scale * d1 * (d1 + 2.0) / ((d1 + extra) ** 2 + 2.0 * half)
-        variance = more * (1.0 + 2.0 * (first + d2 - 2.0) / (first * (d2 - 4.0))) - 1.0
+        variance = more * (1.0 + 2.0 * (first + second - 2.0) / (first * (second - 4.0))) - 1.0
         wide = (2.0 * first - 4.0 + 4.0 * variance * first) / (variance * first - 2.0)
-        x, d2 = x * (d2 - 2.0) / d2 * wide / (wide - 2.0), wide
-    return np.asarray(special.fdtrc(first, d2, x))
+        x, second = x * (second - 2.0) / second * wide / (wide - 2.0), wide
+    return first, second, x

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mcsim.errors import InputError
-from mcsim.stats.elliptical import f_tail, leave_one_out, scale_variance
+from mcsim.stats.elliptical import f_log_density, f_tail, leave_one_out, scale_variance
 from mcsim.stats.few_draws import covariance_of_draws
 from mcsim.stats.shrinkage import Fold, shrunk
 from mcsim.support.arrays import Matrix, Vector, divided
@@ -174,6 +174,19 @@ class SimulatedGaussian:
         """Return the p-value of chi^2 after ``fitted`` columns have been fitted; see :func:`residual_pvalue`."""
         dimension = self.dimension - np.asarray(fitted)
         return residual_pvalue(chi2, dimension, self.dof, allowance, self.scale_variance, spread)
+
+    def log_odds_of_scatter(
+        self, chi2: ArrayLike, fitted: ArrayLike, added: ArrayLike, spread: ArrayLike
+    ) -> NDArray[np.float64]:
+        """Return the log-odds for a further covariance of this trace, and this one of its square, from a chi^2.
+
+        They are those of chi^2 after ``fitted`` columns have been fitted, whose distributions with the covariance and
+        without it are those of :meth:`residual_test`, without a scale, of which :meth:`log_likelihood` knows nothing.
+        """
+        q = np.maximum(self.dimension - np.asarray(fitted, dtype=float), 1.0)
+        d2 = self.dof - q + 1.0
+        f = d2 / q * np.asarray(chi2) / self.dof
+        return f_log_density(f, q, d2, added, spread) - f_log_density(f, q, d2)
 
     def nested_test(
         self,

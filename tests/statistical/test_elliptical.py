@@ -27,6 +27,15 @@ def test_without_a_scale_the_tails_are_fishers() -> None:
     np.testing.assert_allclose(f_tail(f, d1, d2, scale=1e-9), f_tail(f, d1, d2), rtol=1e-4)
 
 
+def test_odds_of_a_covariance_that_grows_alike_everywhere_are_those_of_gaussian_data() -> None:
+    q, growth, chi2 = 40, 3.0, np.array([20.0, 40.0, 120.0, 300.0])
+    null = SimulatedGaussian(np.zeros(q + 2), np.eye(q + 2), 1_000_000_000)
+    found = null.log_odds_of_scatter(chi2, 2, q * (growth - 1.0), q * (growth - 1.0) ** 2)
+    exact = 0.5 * (chi2 * (1.0 - 1.0 / growth) - q * np.log(growth))
+    np.testing.assert_allclose(found, exact, atol=1e-4)
+    np.testing.assert_allclose(null.log_odds_of_scatter(chi2, 2, 0.0, 0.0), 0.0, atol=1e-12)
+
+
 def test_student_vectors_are_exact_for_a_known_covariance() -> None:
     variance, q, chi2 = 0.02, 50, np.array([30.0, 60.0, 90.0, 120.0])
     shape = 2.0 + 1.0 / variance

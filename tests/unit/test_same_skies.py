@@ -163,16 +163,18 @@ def test_the_dipole_that_a_gain_leaves_in_the_only_channel_is_a_residual_one() -
     assert skies.dipole_left([config.Effect(name="noise_level", channel="V1", parameters={"amplitude": 0.1})]) == []
 
 
-def test_noise_alone_is_compared_in_as_many_skies_as_there_are_without_it() -> None:
-    """More skies may be constrained by data than there are of responses that are random."""
-    settings = DiagnosisSettings.quick(constrained_skies=16)
+def test_noise_alone_is_compared_in_all_skies_that_there_are_without_it() -> None:
+    """What it adds to the scatter of the data is known from as many skies as were simulated."""
+    settings = DiagnosisSettings.quick()
     context = SimpleNamespace(
         settings=settings,
         analysis=SimpleNamespace(library=tuple(systematics.catalogue().items())),
-        reference=lambda found: np.zeros((settings.noisy_skies, 3)),
+        extended_reference=lambda found: np.zeros((settings.noisy_skies, 4)),
     )
     data = ObservedMaps(context, (), list)  # type: ignore[arg-type]
     vars(data)["_measured"] = (np.zeros(3),)
-    vars(data)["same_skies"] = SimpleNamespace(of_reference=lambda found, skies: np.ones((skies, 4)))
+    vars(data)["same_skies"] = SimpleNamespace(
+        of_reference=lambda found: np.ones((settings.noisy_skies, 4)), dipole_left=lambda found: []
+    )
     before, after = data.pair([config.Effect(name="noise_level", channel="W1")])
     assert before.shape == after.shape == (settings.noisy_skies, 3)
