@@ -33,7 +33,7 @@ from mcsim.errors import InputError
 from mcsim.simulation import convolve
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
 from mcsim.simulation.noise import NoiseOfFiles
-from mcsim.simulation.preparation import keeps_pixels, regressions
+from mcsim.simulation.preparation import keeps_pixels, regressions, templates_of
 from mcsim.simulation.survey import Channel, Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
@@ -76,6 +76,7 @@ class Model:
     #: s^ is that of the mean of all maps, and what they have alike beside it is sky beyond lmax, of this variance, uK^2
     pooled: float = 0.0
     tolerance: float = 1.0  # of the inverse covariance, over that of the settings
+    bright: bool = False  # the maps show the sky beyond lmax
 
     @property
     def frame(self) -> str:
@@ -113,6 +114,34 @@ class Model:
         rows, which = np.unique(self.response, axis=0, return_inverse=True)
         groups = (np.flatnonzero(which.ravel() == row) for row in range(len(rows)))
         return tuple((row, sum(map(self.of, group.tolist()), ())) for row, group in zip(rows, groups, strict=True))
+
+    @cached_property
+    def masks(self) -> tuple[Map, ...]:
+        """Return the weights that the preparation has multiplied every map with; 0 also where others are smeared in."""
+        each = (None if one is None else one.sharp_weight() for one in self.survey.preparations)
+        pairs = zip(self.parts, each, strict=True)
+        return tuple(np.ones(part.precision.size) if own is None else own for part, own in pairs)
+
+    @cached_property
+    def unmasked(self) -> "Model | None":
+        """Return the model with the inverse covariance of maps over their masks, as if their noise were white.
+
+        To an isotropic filter zeros in a mask are data: skies that filtered maps constrain had many times their power
+        at high degrees. None: nothing is hidden, or the maps show the sky beyond lmax.
+        """
+        hidden = max(float(np.mean(part.precision == 0.0)) for part in self.parts)
+        if hidden < self.settings.hidden_share or self.bright:
+            return None
+        templates = templates_of(self.survey.preparations)
+        parts = [
+            replace(
+                part,
+                precision=part.precision * mask**2,
+                subtracted=() if own is None else ((divided(own, mask), part.precision),),
+            )
+            for part, mask, own in zip(self.parts, self.masks, templates, strict=True)
+        ]
+        return replace(self, inverse=inverse_of(self.cl, self.response, parts))
 
     @cached_property
     def exact(self) -> "Model":
@@ -190,7 +219,7 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
         parts = list(marginalised(survey, parts))
         inverse = inverse_of(cl, response, parts)
     maps = survey.nside, cl, response, tuple(parts), dipole_alm(survey.channels[0].site.dipole_uk, lmax)
-    model = Model(survey, lmax, *maps, inverse, known and white, snr / (1.0 + snr), settings)
+    model = Model(survey, lmax, *maps, inverse, known and white, snr / (1.0 + snr), settings, bright=bright)
     return replace(_pooled(model, unresolved), exact_known=white) if pixels and bright else model
 
 
@@ -365,7 +394,10 @@ def shared_sky(model: Model, maps: Sequence[Map]) -> Alm:
     # The inverse covariance of a mean takes the sky beyond for more noise of other degrees than it is: of a constrained
     # sky that is filtered so, a quarter of the power would be missing at the last degrees.
     model = replace(model, inverse=None, pooled=0.0) if model.pooled else model
-    return _sky(model, _clean(model, maps)[0], careful=True)
+    clean = _clean(model, maps)[0]
+    if model.inverse is None and model.unmasked is not None:
+        model, clean = model.unmasked, [divided(*one) for one in zip(clean, model.masks, strict=True)]
+    return _sky(model, clean, careful=True)
 
 
 def _clean(model: Model, maps: Sequence[Map]) -> tuple[list[Map], list[NDArray[np.bool_]]]:

@@ -26,6 +26,8 @@ from mcsim.support.arrays import Map
 from mcsim.support.loading import once_per_content
 from mcsim.systematics import Site
 
+SMEARED = 0.07  #: of the weight of a pixel that a step in harmonics has changed
+
 LARGEST_GAIN = 10.0  #: of B_l by a change of the beam: a target that asks for more is narrower than the beam
 
 
@@ -139,6 +141,18 @@ class Preparation:
                 weight = step.mask if weight is None else weight * step.mask
             elif weight is not None and not isinstance(step, Filled):
                 weight = step.local(weight)
+        return weight
+
+    def sharp_weight(self) -> Map | None:
+        """Return :meth:`weight`, 0 where a step in harmonics has smeared it by more than SMEARED."""
+        weight: Map | None = None
+        for step in self.steps:
+            if isinstance(step, Weighted):
+                weight = step.mask if weight is None else weight * step.mask
+            elif weight is not None and not isinstance(step, Filled | Regression):
+                local = np.nan_to_num(step.local(weight))
+                smeared = step.apply(weight) - local if step.transforms else np.zeros(local.size)
+                weight = np.where(np.abs(smeared) > SMEARED, 0.0, local)
         return weight
 
     def moments(self, moments: Moments) -> Moments:
