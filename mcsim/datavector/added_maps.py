@@ -10,7 +10,7 @@ import numpy as np
 from mcsim import config, systematics
 from mcsim.datavector.analysis import Analysis
 from mcsim.datavector.campaign import with_effects
-from mcsim.datavector.wiener_filter import shared_sky
+from mcsim.datavector.shared_sky import shared_sky
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_

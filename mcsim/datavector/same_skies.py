@@ -13,7 +13,8 @@ from mcsim import config, systematics
 from mcsim.datavector.added_maps import Added, AddedMaps
 from mcsim.datavector.analysis import Analysis, Job
 from mcsim.datavector.campaign import Ask, after_jobs, constrained_jobs
-from mcsim.datavector.wiener_filter import inverse_of, shared_sky
+from mcsim.datavector.shared_sky import shared_sky
+from mcsim.datavector.wiener_filter import seen_through
 from mcsim.instrument.beams import Beam
 from mcsim.simulation import convolve
 from mcsim.simulation.channels import table_of
@@ -106,9 +107,7 @@ class SameSkies:
         pairs = zip(maps, gains[[part.channel for part in model.parts]], strict=True)
         given = [map_ if g == 1.0 else np.where(map_ == healpy.UNSEEN, map_, map_ / g) for map_, g in pairs]
         if np.any((shapes := rows / gains[:, None]) != 1.0):
-            response = model.response * shapes
-            inverse = None if model.inverse is None else inverse_of(model.cl, response, model.parts)
-            model = replace(model, response=response, inverse=inverse)
+            model = seen_through(model, model.response * shapes)
         return shared_sky(model, given)
 
     def _without(self, orders: Orders, sky: Alm, maps: Sequence[Map]) -> list[Map]:

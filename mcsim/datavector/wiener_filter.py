@@ -43,7 +43,6 @@ from mcsim.support.arrays import Alm, Cl, Map, Matrix, Vector, divided
 FAINT = 0.1
 """Power of the sky over that of the noise at the last degree of the filters; what is above adds below 1 % to sigmas."""
 
-
 SHARP = 30.0
 """Power of the sky over that of the noise at the last degree, up to which conjugate gradients converge soon: the
 preconditioner has no such sharp end (:class:`mcsim.simulation.preconditioner.Preconditioner`)."""
@@ -116,6 +115,11 @@ class Model:
         return tuple((row, sum(map(self.of, group.tolist()), ())) for row, group in zip(rows, groups, strict=True))
 
     @cached_property
+    def hides(self) -> bool:
+        """Return True if a map lacks a part of the sky that is more than little."""
+        return hidden_share(self.parts) >= self.settings.hidden_share
+
+    @cached_property
     def masks(self) -> tuple[Map, ...]:
         """Return the weights that the preparation has multiplied every map with; 0 also where others are smeared in."""
         each = (None if one is None else one.sharp_weight() for one in self.survey.preparations)
@@ -127,20 +131,15 @@ class Model:
         """Return the model with the inverse covariance of maps over their masks, as if their noise were white.
 
         To an isotropic filter zeros in a mask are data: skies that filtered maps constrain had many times their power
-        at high degrees. None: nothing is hidden, or the maps show the sky beyond lmax.
+        at high degrees. None: nothing is hidden, or the maps show the sky beyond lmax, or far above the noise there.
         """
-        hidden = max(float(np.mean(part.precision == 0.0)) for part in self.parts)
-        if hidden < self.settings.hidden_share or self.bright:
+        if not self.hides or self.bright or self.sky_power[self.lmax] > SHARP / (1.0 + SHARP):
             return None
         templates = templates_of(self.survey.preparations)
-        parts = [
-            replace(
-                part,
-                precision=part.precision * mask**2,
-                subtracted=() if own is None else ((divided(own, mask), part.precision),),
-            )
-            for part, mask, own in zip(self.parts, self.masks, templates, strict=True)
-        ]
+        parts = []
+        for part, mask, own in zip(self.parts, self.masks, templates, strict=True):
+            subtracted = () if own is None else ((divided(own, mask), part.precision),)
+            parts.append(replace(part, precision=part.precision * mask**2, subtracted=subtracted))
         return replace(self, inverse=inverse_of(self.cl, self.response, parts))
 
     @cached_property
@@ -208,19 +207,23 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
             parts.append(Part(index, m.name, split, m.moments, precision, noise_power))
     snr = survey.cl * sum(response[part.channel] ** 2 / part.noise_power for part in parts)
     lmax = _highest_degree(survey, snr)
-    hidden = max(float(np.mean(part.precision == 0.0)) for part in parts)
     pixels = all(m.preparation is None or m.preparation.keeps_noise_white for m in survey.maps)
     white = pixels and all(m.drawn is None and m.pairs is None for m in survey.maps)
     bright = bool(np.any(snr[lmax + 1 :] > 1.0))
     unresolved = (np.arange(snr.size) > lmax) * np.sqrt(survey.cl) * response
     cl, response, snr = survey.cl[: lmax + 1], response[:, : lmax + 1], snr[: lmax + 1]
     known, inverse = pixels and not bright and bool(snr[lmax] <= SHARP), None
-    if known and hidden >= settings.hidden_share:
+    if known and hidden_share(parts) >= settings.hidden_share:
         parts = list(marginalised(survey, parts))
         inverse = inverse_of(cl, response, parts)
     maps = survey.nside, cl, response, tuple(parts), dipole_alm(survey.channels[0].site.dipole_uk, lmax)
     model = Model(survey, lmax, *maps, inverse, known and white, snr / (1.0 + snr), settings, bright=bright)
     return replace(_pooled(model, unresolved), exact_known=white) if pixels and bright else model
+
+
+def hidden_share(parts: Sequence[Part]) -> float:
+    """Return the share of the sky that the map which lacks most of it does not show."""
+    return max(float(np.mean(part.precision == 0.0)) for part in parts)
 
 
 def _pooled(model: Model, unresolved: Matrix) -> Model:
@@ -236,8 +239,7 @@ def _pooled(model: Model, unresolved: Matrix) -> Model:
         replace(part, precision=part.precision / (1.0 + own[part.channel] * part.precision), subtracted=tuple(one))
         for part, one in zip(model.parts, regressions(model.survey.preparations), strict=True)
     ]
-    total = np.sum([part.precision for part in parts], axis=0)
-    response, precision = _mean(model.response, model.parts), total / (1.0 + alike * total)
+    response, precision = _mean(model.response, model.parts), _precision(parts, alike)
     snr = model.cl * response**2 * precision.sum() / (4.0 * np.pi)
     return replace(
         model,
@@ -257,6 +259,22 @@ def _mean(rows: Matrix, parts: Sequence[Part]) -> Vector:
 
 def _of_mean(cl: Cl, response: Vector, precision: Map) -> InverseCovariance:
     return InverseCovariance(cl, [ObservedMap(convolve.Response(response[None].astype(np.complex128)), precision)])
+
+
+def _precision(parts: Sequence[Part], alike: float) -> Map:
+    """Return the inverse variance of the mean of all maps, which have more of this variance alike, uK^-2, (npix,)."""
+    total = np.sum([part.precision for part in parts], axis=0)
+    return np.asarray(total / (1.0 + alike * total))
+
+
+def seen_through(model: Model, response: Matrix) -> Model:
+    """Return the model if its channels see the sky through another response, shape (channel, lmax + 1)."""
+    inverse = model.inverse
+    if model.pooled:
+        inverse = _of_mean(model.cl, _mean(response, model.parts), _precision(model.parts, model.pooled))
+    elif inverse is not None:
+        inverse = inverse_of(model.cl, response, model.parts)
+    return replace(model, response=response, inverse=inverse)
 
 
 def inverse_of(cl: Cl, response: Matrix, parts: Sequence[Part], offsets: bool = False) -> InverseCovariance:
@@ -314,8 +332,8 @@ def _variance(root: Cl) -> float:
 def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
     """Filter maps of all parts, uK, shape (npix,) each; ``healpy.UNSEEN`` or NaN is not observed."""
     lmax, top = model.lmax, model.settings.beam_orders
-    clean, seen = _clean(model, maps)
-    sky = _sky(model, clean)
+    clean, seen = cleaned(model, maps)
+    sky = filtered_sky(model, clean)
     looked_at = sky + model.dipole
     expected, mean = _expected(model, clean, sky)
     residual, adjoint = np.empty_like(expected), np.empty((len(model.parts), sky.size), dtype=np.complex128)
@@ -382,25 +400,7 @@ def _summed(model: Model, maps: Sequence[Map]) -> tuple[Map, Map]:
     return np.sum([one * map_ for one, map_ in zip(precision, maps, strict=True)], axis=0), np.sum(precision, axis=0)
 
 
-def shared_sky(model: Model, maps: Sequence[Map]) -> Alm:
-    """Return the filtered sky s^ of a set of maps, up to the model's lmax, uK.
-
-    Notes
-    -----
-    It is found to a hundredth of the tolerance of :func:`wiener_filter`. By quadrature alone, what leaks
-    between degrees adds power to s^: skies that it constrains had 2 % too much at l > 2.2 nside, and responses in them
-    were 0.8 % too large. One iteration of the analysis takes most of it away where the filter is isotropic.
-    """
-    # The inverse covariance of a mean takes the sky beyond for more noise of other degrees than it is: of a constrained
-    # sky that is filtered so, a quarter of the power would be missing at the last degrees.
-    model = replace(model, inverse=None, pooled=0.0) if model.pooled else model
-    clean = _clean(model, maps)[0]
-    if model.inverse is None and model.unmasked is not None:
-        model, clean = model.unmasked, [divided(*one) for one in zip(clean, model.masks, strict=True)]
-    return _sky(model, clean, careful=True)
-
-
-def _clean(model: Model, maps: Sequence[Map]) -> tuple[list[Map], list[NDArray[np.bool_]]]:
+def cleaned(model: Model, maps: Sequence[Map]) -> tuple[list[Map], list[NDArray[np.bool_]]]:
     """Return maps with zeros in pixels that the fiducial scan does not hit, and where something was observed.
 
     Pixels that the data lack and the simulations have are filled with the filtered sky: zeros would be a departure of
@@ -411,7 +411,7 @@ def _clean(model: Model, maps: Sequence[Map]) -> tuple[list[Map], list[NDArray[n
     clean = [np.where(observed, map_, 0.0) for observed, map_ in zip(seen, maps, strict=True)]
     holes = {i: hit[i] & ~seen[i] for i in range(len(hit)) if np.any(hit[i] & ~seen[i])}
     for _ in range(model.settings.hole_iterations if holes else 0):
-        sky = _sky(model, clean)
+        sky = filtered_sky(model, clean)
         for i, hole in holes.items():
             through = alm_.multiply(sky, model.response[model.parts[i].channel], model.lmax)
             smooth = healpix.synthesis(through[None], model.nside, model.lmax)[0]
@@ -419,7 +419,8 @@ def _clean(model: Model, maps: Sequence[Map]) -> tuple[list[Map], list[NDArray[n
     return [part.without_subtracted(map_) for part, map_ in zip(model.parts, clean, strict=True)], seen
 
 
-def _sky(model: Model, clean: Sequence[Map], careful: bool = False) -> Alm:
+def filtered_sky(model: Model, clean: Sequence[Map], careful: bool = False) -> Alm:
+    """Return the filtered sky s^ of maps that are clean, up to the model's lmax, uK; see :func:`shared_sky`."""
     lmax, settings = model.lmax, model.settings
     if model.inverse is not None:
         maps = divided(*_summed(model, clean))[None] if model.pooled else np.stack(clean)

@@ -163,7 +163,8 @@ class Subsets:
         spread = np.sum(self._beside.spread[subsets] * parts**2, axis=1)
         left = self.total - delta_chi2
         evidence = log_evidence(null, self.total, delta_chi2, K, self.settings.prior_snr)
-        wide = scatter > 0.0
+        # What effects add to the scatter is known over that of the model alone.
+        wide = (scatter > 0.0) & (not self.scattered)
         evidence[wide] += null.log_odds_of_scatter(left[wide], K, scatter[wide], spread[wide])
         prior = special.gammaln(size + 1) - size * np.log(len(self.candidates))
         return Solved(

@@ -82,10 +82,8 @@ CODE = (
     *("config", "sphere", "instrument", "systematics", "bipolar", "simulation"),
     *(f"reconstruction.{name}" for name in ("choices", "forms", "periods", "scores", "simulated_scores", "sources")),
     "reconstruction.sky_changes",
-    *(
-        f"datavector.{name}"
-        for name in ("analysis", "matched_filters", "parts", "pixel_noise", "untouched_maps", "wiener_filter")
-    ),
+    *(f"datavector.{name}" for name in ("analysis", "matched_filters", "parts", "pixel_noise", "shared_sky")),
+    *("datavector.untouched_maps", "datavector.wiener_filter"),
 )
 """What scores of simulations are computed with."""
 

@@ -16,7 +16,8 @@ from mcsim.datavector import bipolar_scan, campaign, localisation
 from mcsim.datavector.analysis import analysis_of, data_vectors, on_request
 from mcsim.datavector.campaign import with_effects
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import shared_sky, wiener_filter
+from mcsim.datavector.shared_sky import shared_sky
+from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.diagnosis import api, inference, words
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.inference import diagnose_data

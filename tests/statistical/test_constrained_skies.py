@@ -7,7 +7,7 @@ from mcsim import config
 from mcsim.bipolar import power_spectrum
 from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.campaign import seeded
-from mcsim.datavector.wiener_filter import shared_sky
+from mcsim.datavector.shared_sky import shared_sky
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 

@@ -13,7 +13,8 @@ from mcsim import bipolar, config, systematics
 from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.matched_filters import matched_filter
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import model_of, shared_sky, wiener_filter
+from mcsim.datavector.shared_sky import shared_sky
+from mcsim.datavector.wiener_filter import model_of, wiener_filter
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
 from mcsim.simulation import pixel_means, simulate

@@ -13,8 +13,9 @@ from mcsim.datavector.analysis import analysis_of, data_vectors
 from mcsim.datavector.bipolar_scan import BipolarScan
 from mcsim.datavector.parts import LEFT
 from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.datavector.shared_sky import shared_sky
 from mcsim.datavector.summaries import blocks_of
-from mcsim.datavector.wiener_filter import model_of, shared_sky, wiener_filter
+from mcsim.datavector.wiener_filter import model_of, wiener_filter
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_

@@ -11,7 +11,7 @@ from mcsim.bipolar import power_spectrum
 from mcsim.datavector.analysis import analysis_of, simulated_maps
 from mcsim.datavector.campaign import constrained_jobs
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import shared_sky
+from mcsim.datavector.shared_sky import shared_sky
 from mcsim.reconstruction.plugin import Plugin
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
