@@ -16,7 +16,7 @@ from mcsim.diagnosis.subsets import EXHAUSTIVE, Subsets, chunks
 from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
-from mcsim.stats.scattered import variance_beside
+from mcsim.stats.scattered import Acting, Groups, variance_beside
 from mcsim.support.arrays import Matrix, Rows, Vector
 
 Verdict = Literal["none", "effect", "mixture", "degenerate", "unknown"]
@@ -296,7 +296,15 @@ class Selection:
         wide = self.null.with_extra_covariance(*known)
         beside = variance_beside(self.null, self.t, columns, list(scatters), known)
         groups, y = wide.whiten_groups(self.t, columns), wide.whiten(self.x)
-        return Subsets(wide, y, groups, self.candidates, self.calibration, self.settings, tuple(scatters), beside)
+        # What others add to the scatter is less over the scatter of these.
+        each = self.candidates if not scatters else list(self._acting_beside(wide, columns))
+        return Subsets(wide, y, groups, each, self.calibration, self.settings, tuple(scatters), beside)
+
+    def _acting_beside(self, wide: SimulatedGaussian, columns: Groups) -> Iterator[Candidate]:
+        """Yield the candidates with what they add to the scatter of data of another distribution."""
+        for place, one in enumerate(self.candidates):
+            pair = None if one.acting is None else one.acting.pair
+            yield one if pair is None else replace(one, acting=Acting.of(wide, self.t, columns, place, pair))
 
     def _possible(self, found: Iterable[_Accepted]) -> Iterator[_Accepted]:
         """Yield the sets whose fitted amplitudes are possible, with the evidence of the nearest ones within bounds."""

@@ -163,8 +163,7 @@ class Subsets:
         spread = np.sum(self._beside.spread[subsets] * parts**2, axis=1)
         left = self.total - delta_chi2
         evidence = log_evidence(null, self.total, delta_chi2, K, self.settings.prior_snr)
-        # What effects add to the scatter is known over that of the model alone.
-        wide = (scatter > 0.0) & (not self.scattered)
+        wide = scatter > 0.0
         evidence[wide] += null.log_odds_of_scatter(left[wide], K, scatter[wide], spread[wide])
         prior = special.gammaln(size + 1) - size * np.log(len(self.candidates))
         return Solved(

@@ -15,7 +15,7 @@ STEEPEST = 1e3  #: condition number above which derivatives tell no errors
 Groups = Sequence[Sequence[int]]  #: columns of the templates of each candidate
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Acting:
     """Hold by how much an effect that acts at some amplitude scatters the data more than they are without it."""
 
@@ -27,6 +27,8 @@ class Acting:
     excess: Vector
     error: Vector
     own: float = 0.0  #: what it adds to the variance along its own response, over what that is without it
+    #: data vectors of the same skies without the effect and with it, from which all this is known, (skies, p_raw) each
+    pair: tuple[Matrix, Matrix] | None = None
 
     @classmethod
     def of(cls, null: SimulatedGaussian, t: Matrix, groups: Groups, own: int, pair: tuple[Matrix, Matrix]) -> "Acting":
@@ -53,7 +55,7 @@ class Acting:
             excess[number], error[number] = _growth(x @ beside, c @ beside)
         along = divided(basis.T @ mean, np.linalg.norm(basis.T @ mean))
         growth, _ = _growth(x @ basis @ along[:, None], c @ basis @ along[:, None])
-        return cls(size, *scatter_chi2(null, t[:, list(groups[own])], *pair), excess, error, growth)
+        return cls(size, *scatter_chi2(null, t[:, list(groups[own])], *pair), excess, error, growth, pair)
 
 
 def _growth(x: Matrix, c: Matrix) -> tuple[float, float]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mcsim.datavector.candidate import Candidate
+from benches import Bench, P, candidate, directions, singles, twelve_and_two
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import words
 from mcsim.diagnosis.inference import confirmed
@@ -18,51 +18,14 @@ from mcsim.diagnosis.partial import PartialExplanation, PartialSearch
 from mcsim.diagnosis.selection import Attribution, Contrast, attribute
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.stats.excess import HeldOut, Measured
-from mcsim.stats.gaussian import SimulatedGaussian
-from mcsim.stats.look_elsewhere import calibrate
 from mcsim.stats.scattered import Acting
-from mcsim.systematics import Effect, Parametrization
 
-P, N = 60, 800
 ALPHA = 0.05
-
-
-def candidate(name: str, channel: str | None, columns: tuple[int, ...], settings=None, sign=0, largest=np.inf, **more):
-    """Return a candidate of an effect that does nothing."""
-    fitted = Parametrization(sign=sign, max_amplitude=largest)
-    attributes = {"name": name, "unit": "", "scope": "channel", "step": 1.0, "parametrization": fitted}
-    return Candidate(type(name, (Effect,), attributes), channel, columns, settings or {}, **more)
-
-
-class Bench:
-    """Candidates on a data vector of 60 unit normals with a fiducial ensemble of 800 simulations."""
-
-    def __init__(self, t: np.ndarray, candidates: list[Candidate]) -> None:
-        self.null = SimulatedGaussian.from_simulations(np.random.default_rng(7).normal(size=(N, P)))
-        self.t, self.candidates = t, candidates
-        self.whitened_templates = self.null.whiten_groups(t, [candidate.columns for candidate in candidates])
-        self.calibration = calibrate(self.null, self.whitened_templates)
-
-    def diagnose_maps(self, signal: np.ndarray, seed: int, **options) -> Attribution:
-        x = signal + np.random.default_rng(seed).normal(size=P)
-        settings = replace(DiagnosisSettings(), **options)
-        return attribute(self.null, x, self.t, self.candidates, self.calibration, settings)
-
-
-def directions(count: int, seed: int) -> np.ndarray:
-    t = np.random.default_rng(seed).normal(size=(P, count))
-    return t / np.linalg.norm(t, axis=0)
-
-
-def singles(count: int) -> list[Candidate]:
-    return [candidate(f"effect{i}", None, (i,)) for i in range(count)]
 
 
 @pytest.fixture(scope="module")
 def bench() -> Bench:
-    """Twelve single templates, then a pair and a triple of columns."""
-    candidates = [*singles(12), candidate("pair", "W1", (12, 13)), candidate("triple", "W2", (14, 15, 16))]
-    return Bench(directions(17, 8), candidates)
+    return twelve_and_two()
 
 
 def verdicts(bench: Bench, signal: np.ndarray, draws: int, **options) -> list[Attribution]:
@@ -388,21 +351,6 @@ def test_what_is_detected_beside_an_effect_stands_out_of_the_scatter_that_it_add
         own = {"acting": Acting(size=900.0, chi2=0.0, spread=0.0, excess=excess, error=0.0 * excess)}
     acting = [replace(bench.candidates[0], **own), *bench.candidates[1:]]
     assert detected(bench, x, candidates=acting).members == (0,)
-
-
-def test_an_effect_that_scatters_the_data_is_probable_although_it_leaves_much(bench):
-    """All elements vary 2.5 times as much with it as without it, beside an S/N of 30."""
-    growth, columns = 2.5**2 - 1.0, P - 1
-    excess = np.full(len(bench.candidates), growth)
-    own = Acting(size=900.0, chi2=growth * columns, spread=growth**2 * columns, excess=excess, error=0.01 * excess)
-    candidates = [replace(bench.candidates[0], acting=own), *bench.candidates[1:]]
-    named = 0
-    for seed in range(20):
-        x = 30.0 * bench.t[:, 0] + 2.5 * np.random.default_rng(seed).normal(size=P)
-        found = attribute(bench.null, x, bench.t, candidates, bench.calibration).if_named(DiagnosisSettings())
-        named += found.verdict == "effect" and found.explanations[0].members == (0,)
-    # 94 % by the levels of both tests, less three sigma.
-    assert named >= 16
 
 
 UNSURE = Measured(0.0, 100.0)
