@@ -122,7 +122,7 @@ class Model:
     @cached_property
     def masks(self) -> tuple[Map, ...]:
         """Return the weights that the preparation has multiplied every map with; 0 also where others are smeared in."""
-        each = (None if one is None else one.sharp_weight() for one in self.survey.preparations)
+        each = (None if one is None else one.weight(sharp=True) for one in self.survey.preparations)
         pairs = zip(self.parts, each, strict=True)
         return tuple(np.ones(part.precision.size) if own is None else own for part, own in pairs)
 

@@ -133,26 +133,19 @@ class Preparation:
                 found = [(np.stack(list(map(step.apply, one))), step.local(weight)) for one, weight in found]
         return [(np.nan_to_num(columns), np.nan_to_num(weight)) for columns, weight in found]
 
-    def weight(self) -> Map | None:
-        """Return the product of the masks of the steps in the prepared pixels; None without one."""
+    def weight(self, sharp: bool = False) -> Map | None:
+        """Return the product of the masks of the steps in the prepared pixels; None without one.
+
+        ``sharp``: 0 where a step in harmonics has smeared it by more than SMEARED.
+        """
         weight: Map | None = None
         for step in self.steps:
             if isinstance(step, Weighted):
                 weight = step.mask if weight is None else weight * step.mask
             elif weight is not None and not isinstance(step, Filled):
-                weight = step.local(weight)
-        return weight
-
-    def sharp_weight(self) -> Map | None:
-        """Return :meth:`weight`, 0 where a step in harmonics has smeared it by more than SMEARED."""
-        weight: Map | None = None
-        for step in self.steps:
-            if isinstance(step, Weighted):
-                weight = step.mask if weight is None else weight * step.mask
-            elif weight is not None and not isinstance(step, Filled | Regression):
-                local = np.nan_to_num(step.local(weight))
-                smeared = step.apply(weight) - local if step.transforms else np.zeros(local.size)
-                weight = np.where(np.abs(smeared) > SMEARED, 0.0, local)
+                before, weight = weight, step.local(weight)
+                if sharp and step.transforms:
+                    weight = np.where(np.abs(step.apply(before) - weight) > SMEARED, 0.0, weight)
         return weight
 
     def moments(self, moments: Moments) -> Moments:
