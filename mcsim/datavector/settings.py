@@ -233,7 +233,7 @@ class DiagnosisSettings:
     time_ordered_skies: int = 3
     scan_sims: int = 300
 
-    refine_rounds: int = 4
+    refine_rounds: int = 8
     joint_rounds: int = 4
     nonlinear_sigma: float = 0.5
     noisy_share: float = 0.01

@@ -17,6 +17,7 @@ from mcsim.stats.scattered import Acting
 from mcsim.support.arrays import Matrix, Vector
 
 ALIKE = 0.7  #: cosine of linear responses from which on one candidate can pass for another
+STEEPEST = 9.0  #: a response is never taken to grow with more than the tenth power of its amplitude
 NEARLY = 0.8  #: share of what the best single candidate explains, from which on others are tried that explain less
 
 
@@ -36,12 +37,23 @@ class Refined:
 
 @dataclass(frozen=True)
 class _Responses:
-    """Hold linear templates, those at the amplitudes that were simulated, candidates, and these amplitudes."""
+    """Hold linear templates, those at the amplitudes that were simulated, candidates, and these amplitudes.
+
+    They are the nearest possible ones to those ``asked`` for. ``last`` has where a candidate was simulated before, and
+    the amplitudes that the data had by the templates of there.
+    """
 
     linear: Matrix
     t: Matrix
     candidates: list[Candidate]
     done: dict[int, Vector | None] = field(default_factory=dict)
+    asked: dict[int, Vector] = field(default_factory=dict)
+    last: dict[int, tuple[Vector, Vector]] = field(default_factory=dict)
+
+    def copy(self) -> "_Responses":
+        """Return another one to which nothing of what is simulated from now on is added."""
+        own = {**self.done}, {**self.asked}, {**self.last}
+        return _Responses(self.linear, self.t.copy(), [*self.candidates], *own)
 
 
 @dataclass(frozen=True)
@@ -72,10 +84,11 @@ class Refiner:
         that can have neither the fitted amplitude nor half of it is taken out. Of a stochastic one the scatter of the
         response is kept, of any other one by how much it scatters the data. Where the power of an effect counts,
         which grows as the square of the amplitude, the secant at a_0 finds a^2/a_0 for a: the mean of this and a_0 is
-        Newton's step. With the scatter that it has at the amplitude of a set, a stochastic one may not suffice though
-        it is all: it is tried at the amplitude that it has alone, too, and so is what was simulated far from there in a
-        set of effects that are alike. Members of the best sets are always simulated, and what is like them where its
-        templates may be why it fits worse. A faint gap has the odds of the first templates at most.
+        Newton's step. Of a steeper response two simulations say by how much a falls as a_0 rises. With the scatter that
+        it has at the amplitude of a set, a stochastic one may not suffice though it is all: it is tried at the
+        amplitude that it has alone, too, and so is what was simulated far from there in a set of effects that are
+        alike. Members of the best sets are always simulated, and what is like them where its templates may be why it
+        fits worse. A faint gap has the odds of the first templates at most.
         """
         start = t if start is None else start
         now = _Responses(t, start.copy(), list(candidates))
@@ -137,7 +150,7 @@ class Refiner:
         """
         size = _size(found)
         for members in self._nearly(now, size):
-            beside = _Responses(now.linear, now.t.copy(), [*now.candidates], {**now.done})
+            beside = now.copy()
             for index in members:
                 self._simulate_in_place(beside, tuple(one for one in members if one != index), index)
             together = self._completed(beside, self._attribute(beside.t, beside.candidates))
@@ -221,22 +234,27 @@ class Refiner:
         candidate = now.candidates[index]
         columns, how, done = list(candidate.columns), candidate.parametrization, now.done.get(index)
         within = candidate.nuisance and not self._is_beyond_prior(now.linear[:, columns], len(now.candidates))
-        if within or has_settled(self.context.settings, done, coordinates, covariance):
+        if within or self._has_been(now, index, coordinates, covariance):
             return False
         nonlinear = curved or how.nonlinear or candidate.nuisance or self._is_nonlinear(columns, coordinates)
+        nonlinear = nonlinear or (done is not None and self._is_nonlinear(columns, done))
         # From here on its template is what it does to this very sky, and its prior a part of its error.
         candidate = now.candidates[index] = replace(candidate, nuisance=False)
         stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
         if (stochastic or nonlinear) and done is not None:
             share = self._squared(now.linear[:, columns], now.t[:, columns], done)
+            if index in now.last:
+                share = max(share, _steepness(now.last[index], (done, coordinates), covariance))
+            now.last[index] = done, coordinates
             coordinates = done + (coordinates - done) / (1.0 + share)
-        now.done[index] = coordinates
+        now.done[index] = now.asked[index] = coordinates
         answer = self._simulated(candidate, coordinates, covariance, stochastic)
         if answer is None:
             if nonlinear or stochastic:
                 now.t[:, columns] = 0.0
             return True
         at, changes, pair = answer
+        now.done[index] = at
         there = candidate.table(candidate.with_coordinates(at, np.eye(len(at))))
         if nonlinear or self.data.rescaled([there]):
             now.t[:, columns] += beyond(self.context.null, now.t[:, columns], at, changes.mean(axis=0))
@@ -246,6 +264,17 @@ class Refiner:
             acting = Acting.of(self.context.null, now.t, [one.columns for one in now.candidates], index, pair)
             now.candidates[index] = replace(candidate, acting=acting)
         return True
+
+    def _has_been(self, now: "_Responses", index: int, coordinates: Vector, covariance: Matrix) -> bool:
+        """Return True if a candidate was simulated about at these coordinates, or at the possible ones next to them."""
+        candidate, settings = now.candidates[index], self.context.settings
+        if has_settled(settings, now.asked.get(index), coordinates, covariance):
+            return True
+        try:
+            at = candidate.parametrization.coordinates(candidate.detected(coordinates, covariance))
+        except InputError:
+            return False
+        return has_settled(settings, now.done.get(index), at, covariance)
 
     def _displaced(self, now: "_Responses", first: Attribution, found: Attribution) -> list[int]:
         """Return candidates that explain less alone than by their first templates, and were simulated elsewhere.
@@ -264,8 +293,9 @@ class Refiner:
     def _alone(self, now: "_Responses", start: Matrix, index: int) -> "_Responses":
         """Return the responses with a candidate at the amplitude that it has alone, by its first templates at first."""
         null, columns = self.context.null, list(now.candidates[index].columns)
-        done = {other: at for other, at in now.done.items() if other != index}
-        now = _Responses(now.linear, now.t.copy(), [*now.candidates], done)
+        now = now.copy()
+        for known in (now.done, now.asked, now.last):
+            known.pop(index, None)
         now.t[:, columns] = start[:, columns]
         now.candidates[index] = replace(now.candidates[index], scatter=None)
         for _ in range(self.context.settings.refine_rounds):
@@ -364,6 +394,17 @@ class Refiner:
         shift = self.context.bank.curvature[:, columns] @ coordinates**2
         crossed = float(np.sum(np.abs(coordinates)) ** 2) / max(float(coordinates @ coordinates), 1e-300)
         return crossed * float(np.linalg.norm(self.context.null.whiten_templates(shift[:, None])))
+
+
+def _steepness(before: tuple[Vector, Vector], now: tuple[Vector, Vector], covariance: Matrix) -> float:
+    """Return by how much fitted coordinates fall as those rise that templates are simulated at, 0 to STEEPEST.
+
+    Both are given of two simulations. It is n - 1 of a response that grows with the n-th power of its amplitude.
+    """
+    precision = np.linalg.pinv(covariance)
+    moved, fitted = now[0] - before[0], now[1] - before[1]
+    size = float(moved @ precision @ moved)
+    return float(np.clip(-(moved @ precision @ fitted) / size, 0.0, STEEPEST)) if size > 0.0 else 0.0
 
 
 def _size(found: Attribution) -> int:

@@ -14,7 +14,7 @@ from mcsim.diagnosis.selection import attribute
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate, global_test
-from mcsim.systematics import Effect, Parametrization
+from mcsim.systematics import Bound, Effect, Parametrization
 
 P = 50
 
@@ -28,6 +28,13 @@ class Push(Effect):
     unit = "push"
     cause = signature = ""
     step = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bounded(Push):
+    """One that ends at 12."""
+
+    bounds = (Bound("amplitude", -12.0, 12.0, "a test"),)
 
 
 class Unconstrained(Parametrization):
@@ -98,6 +105,32 @@ def test_a_bent_response_is_found_at_its_amplitude(amplitude):
     found = instrument.refined(x).attribution
     assert [explanation.members for explanation in found.explanations] == [(0,)]
     assert found.explanations[0].fit.amplitudes == pytest.approx([amplitude], abs=0.3)
+
+
+class Steep(Instrument):
+    """The response of A grows with the fifth power of its amplitude."""
+
+    def response(self, a: float, b: float) -> np.ndarray:
+        return self.t[:, 0] * (a + 3e-4 * a**5) + self.t[:, 1] * b
+
+
+@pytest.mark.parametrize("amplitude", [6.0, 10.0, -13.0])
+def test_the_amplitude_of_a_steep_response_is_where_its_secant_says_the_same(amplitude):
+    """A straight line says up to 124, and the secant at that next to nothing, where the response is straight."""
+    instrument = Steep(bend=0.0, cross=0.0)
+    instrument.curvature = np.outer(instrument.t[:, 0], [0.03, 0.0, 0.0])
+    found = instrument.refined(instrument.response(amplitude, 0.0)).attribution
+    assert [explanation.members for explanation in found.explanations] == [(0,)]
+    assert found.explanations[0].fit.amplitudes == pytest.approx([amplitude], abs=0.1)
+    assert len(instrument.analysis) <= 8
+
+
+def test_an_amplitude_at_its_bound_is_simulated_once():
+    """The fit asks for 40, again and again; the effect ends at 12."""
+    instrument = Steep(bend=0.0, cross=0.0)
+    instrument.candidates[0] = replace(instrument.candidates[0], effect=Bounded)
+    instrument.refined(40.0 * instrument.t[:, 0])
+    assert [tables for tables in instrument.analysis if tables.get("A") == pytest.approx(12.0)] == [{"A": 12.0}]
 
 
 @pytest.mark.parametrize(("along", "first"), [(15.9, [["C"], ["A"]]), (21.0, [["C"], ["C"]])])
