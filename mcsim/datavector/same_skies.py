@@ -19,6 +19,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.simulation import convolve
 from mcsim.simulation.channels import table_of
 from mcsim.simulation.survey import Channel
+from mcsim.sphere.alm import degrees, orders
 from mcsim.support.arrays import Alm, Map, Matrix, Vector, divided
 from mcsim.systematics.added import DipoleResidual
 
@@ -176,6 +177,12 @@ class SameSkies:
             return "constrained" if how.mean_response else "typical"
         return "reference" if how.mean_response or self._changes_power(effect) else "constrained"
 
+    def is_pattern(self, effect: config.Effect) -> bool:
+        """Return True for an effect on the observed sky that makes a monopole or a dipole of its other degrees."""
+        built = systematics.build(dict(self.analysis.library)[effect.name], dict(effect.parameters))
+        mixes = makes_means(built, self.analysis.model.survey.channels[0].site)
+        return mixes and self.skies_of(effect) == "constrained"
+
     def _changes_power(self, effect: config.Effect) -> bool:
         """Return True for what a beam, or a pixel, does to the power of the sky of the only channel."""
         kind, alone = dict(self.analysis.library)[effect.name], len(self.analysis.model.channels) == 1
@@ -244,6 +251,16 @@ class SameSkies:
         missing = [job for job in jobs if known[_key(job)] is None]
         known.update(zip(map(_key, missing), self.ask(missing) if missing else [], strict=True))
         return np.concatenate([rows for rows in known.values() if rows is not None])
+
+
+def makes_means(effect: systematics.Effect, site: systematics.Site) -> bool:
+    """Return True if an effect that draws nothing makes a monopole or a dipole of the other degrees of the sky."""
+    if effect.parametrization.stochastic or not systematics.acts_through(effect, "sky"):
+        return False
+    ell, m = degrees(site.lmax), orders(site.lmax)
+    sky = np.asarray(np.where(ell > 1, 1.0 + 1.0j * (m > 0), 0.0), dtype=np.complex128)
+    with_sky, alone = (effect.sky(one, site, lambda stage: np.random.default_rng(0)) for one in (sky, 0.0 * sky))
+    return bool(np.any((with_sky - alone)[ell <= 1]))
 
 
 def _key(job: Job) -> tuple[str, int, int, bytes]:

@@ -109,8 +109,8 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return [own for own in groups if own]
 
     def rescaled(self, found: Sequence[config.Effect]) -> bool:
-        """Return True if the observed sky has to be found as effects let the channels see it."""
-        return any(self.same_skies.seen(found))
+        """Return True if the observed sky has to be found as effects let the channels see it, or is not isotropic."""
+        return any(self.same_skies.seen(found)) or any(map(self.same_skies.is_pattern, found))
 
     def dipole_snr(self, found: Sequence[config.Effect]) -> float:
         """Return the S/N of the dipole that effects leave in the only channel, 0 with several, by noise alone."""
@@ -119,16 +119,23 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return float(left / np.sqrt(3.0 / (4.0 * np.pi) * noise))
 
     def templates(self) -> Matrix:
-        """Return the templates; those that depend on the very sky are measured on the observed one if it departs."""
+        """Return the templates; those that depend on the very sky are measured on the observed one if it departs.
+
+        Of a modulation this holds for odd elements alone. In a part of the sky it is in part a gain, and products of
+        two maps of one sky respond as they fluctuate: behind a mask every sky looks like its own modulation.
+        """
         context, t, settings = self.context, self.context.templates.copy(), self.context.settings
         if self.gap.pvalue > settings.alpha:
             return t
         fixed = [c.random_response or c.nuisance or c.parametrization.mean_response for c in context.candidates]
         depends = ~np.array(fixed) & (context.sky_scatter >= settings.sky_scatter)
         own = [context.candidates[index] for index in np.flatnonzero(depends)]
+        odd = np.array([[element.odd] for element in context.analysis.elements])
         for candidate, response in self.responses(own, settings.constrained_skies):
             columns = list(candidate.columns)
-            t[:, columns] = response[: len(t)] - context.bank.curvature[:, columns] * candidate.steps
+            straight = response[: len(t)] - context.bank.curvature[:, columns] * candidate.steps
+            rows = odd if self.same_skies.is_pattern(candidate.table(candidate.basis[0])) else True
+            t[:, columns] = np.where(rows, straight, t[:, columns])
         return t
 
     def exchanged(self, found: Attribution) -> list[str]:
