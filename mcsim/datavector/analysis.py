@@ -11,13 +11,14 @@ from mcsim import config, systematics
 from mcsim.datavector import slices as slices_
 from mcsim.datavector.bipolar_scan import BipolarScan, coarse_residuals
 from mcsim.datavector.candidate import Candidate, numbered
+from mcsim.datavector.filter_model import Model, model_of
 from mcsim.datavector.map_checks import check_differ, checked_map
 from mcsim.datavector.matched_filters import differencing_filters, matched_filter
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.shared_sky import shared_sky
 from mcsim.datavector.summaries import Block, Element, blocks_of, of_map
 from mcsim.datavector.untouched_maps import UntouchedMaps, without_effects
-from mcsim.datavector.wiener_filter import Model, model_of, wiener_filter
+from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError, RunError
 from mcsim.simulation import differencing, sampled, simulate

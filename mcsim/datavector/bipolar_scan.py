@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from mcsim import bipolar
 from mcsim.bipolar import by_degree
+from mcsim.datavector.filter_model import Model
 from mcsim.datavector.summaries import Element, bins, scales
-from mcsim.datavector.wiener_filter import FilteredMaps, Model
+from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.rotation import FRAMES, rotate_biposh
 from mcsim.support.arrays import Map, Vector, divided

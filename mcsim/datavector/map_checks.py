@@ -9,8 +9,8 @@ import healpy
 import numpy as np
 
 from mcsim import config
+from mcsim.datavector.filter_model import Model, sky_variance
 from mcsim.datavector.parts import Part
-from mcsim.datavector.wiener_filter import Model, sky_variance
 from mcsim.ensemble.external_maps import in_uk, parts_of
 from mcsim.ensemble.maps import POINTING, file_names, first_realization
 from mcsim.errors import InputError

@@ -12,7 +12,8 @@ import numpy as np
 
 from mcsim import systematics
 from mcsim.bipolar import by_degree
-from mcsim.datavector.wiener_filter import FilteredMaps, Model
+from mcsim.datavector.filter_model import Model
+from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.simulation import differencing
 from mcsim.simulation.pixel_means import Part, gain_of, signal_of
 from mcsim.simulation.survey import Channel, SurveyMap

@@ -13,8 +13,8 @@ from mcsim import config, systematics
 from mcsim.datavector.added_maps import Added, AddedMaps
 from mcsim.datavector.analysis import Analysis, Job
 from mcsim.datavector.campaign import Ask, after_jobs, constrained_jobs
+from mcsim.datavector.filter_model import seen_through
 from mcsim.datavector.shared_sky import shared_sky
-from mcsim.datavector.wiener_filter import seen_through
 from mcsim.instrument.beams import Beam
 from mcsim.simulation import convolve
 from mcsim.simulation.channels import table_of

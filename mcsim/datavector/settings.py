@@ -142,8 +142,9 @@ class DiagnosisSettings:
         sky beyond the filters have that of their mean in any case.
     filter_tolerance, filter_iterations
         At which the conjugate gradients of that filter end for typical maps: what is left of the system, relative to
-        what the filter leaves of the sky, and number of iterations. Simulations and data go through the same ones, so
-        that tests hold for any: they cost power alone.
+        what the filter leaves of the sky, and most iterations. Simulations and data go through the same ones, so that
+        tests hold for any: they cost power alone. The sky that responses are measured in has a hundredth of the
+        tolerance, and ten times the iterations.
     sky_bins, beam_bins
         Bins in l of the spectrum of the sky, for each parity of l, which end where the bands of the effect ``spectrum``
         do; of each azimuthal order of a beam, from m = 0.

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from mcsim.datavector.wiener_filter import Model, cleaned, filtered_sky
+from mcsim.datavector.filter_model import Model
+from mcsim.datavector.wiener_filter import cleaned, filtered_sky
 from mcsim.support.arrays import Alm, Map, divided
 
 

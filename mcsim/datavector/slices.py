@@ -9,8 +9,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from mcsim.datavector.filter_model import Model
 from mcsim.datavector.summaries import Element, of_map, sine_of_latitude
-from mcsim.datavector.wiener_filter import FilteredMaps, Model
+from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.sphere import healpix, real
 from mcsim.support.arrays import Matrix, Vector
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.bipolar import by_degree
-from mcsim.datavector.wiener_filter import FilteredMaps, Model
+from mcsim.datavector.filter_model import Model
+from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import rotation_matrix

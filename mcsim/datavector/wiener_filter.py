@@ -8,8 +8,8 @@ On the full sky the first inverse is taken as if noise were isotropic, which cos
 much, and is that of the noise of every pixel, by conjugate gradients (Model.inverse). What describes unlisted effects
 has it on every sky, with the offsets of the samples (Model.exact). Maps that show the sky beyond the filter's last
 degree are filtered by the inverse covariance of their mean, in which that sky is noise of pixels, and what all of them
-have alike in a pixel is taken for sky (_pooled): the isotropic filter leaves it in all residuals, and most effects then
-need 1.3 to 2 times the amplitude.
+have alike in a pixel is taken for sky (Model.pooled): the isotropic filter leaves it in all residuals, and most effects
+then need 1.3 to 2 times the amplitude.
 
 The matched filter of any small change dP_i of a response is <r_i, dP_i s^>: the filtered sky of *all* maps stands in
 for the sky, so that noise limits it, not cosmic variance as for the spectra of a single sky. A change of the beam,
@@ -18,8 +18,8 @@ each order gives that of every beam.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cache, cached_property, reduce
+from dataclasses import dataclass
+from functools import cache, reduce
 
 import healpy
 import numpy as np
@@ -27,133 +27,11 @@ from numpy.typing import NDArray
 
 from mcsim.bipolar import by_degree
 from mcsim.datavector import pixel_noise
-from mcsim.datavector.parts import Part, marginalised
-from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.errors import InputError
+from mcsim.datavector.filter_model import Model
 from mcsim.simulation import convolve
-from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
-from mcsim.simulation.noise import NoiseOfFiles
-from mcsim.simulation.preparation import keeps_pixels, regressions, templates_of
-from mcsim.simulation.survey import Channel, Survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
-from mcsim.sphere.sky import dipole_alm
-from mcsim.support.arrays import Alm, Cl, Map, Matrix, Vector, divided
-
-FAINT = 0.1
-"""Power of the sky over that of the noise at the last degree of the filters; what is above adds below 1 % to sigmas."""
-
-SHARP = 30.0
-"""Power of the sky over that of the noise at the last degree, up to which conjugate gradients converge soon: the
-preconditioner has no such sharp end (:class:`mcsim.simulation.preconditioner.Preconditioner`)."""
-
-CAREFUL = 0.1
-"""Tolerance of the exact filter and of pooled maps, over that of the others: what all maps have alike, nearly all sky,
-is known to a tenth of the rest."""
-
-TAIL = 1e-3  #: part of the squared S/N of a change of a beam that is left beyond the last degree of its order
-EARLIEST = 16  #: degree at which orders may end: bins have degrees
-SAVED = 0.1  #: least part of a transform that an earlier last degree must save
-
-
-@dataclass(frozen=True)
-class Model:
-    """Describe the fiducial survey for the filter."""
-
-    survey: Survey  # without effects, with moments up to the orders that are measured
-    lmax: int  # highest degree of the sky and the matched filters: _highest_degree
-    nside: int
-    cl: Cl  # spectrum of the sky, uK^2
-    response: Matrix  # B_l w_l of every channel, (channel, lmax + 1)
-    parts: tuple[Part, ...]  # the maps in order
-    dipole: Alm  # that the survey sees besides, up to lmax, uK
-    #: of all maps, if they lack a part of the sky, or of their mean, if pooled; None: the isotropic filter
-    inverse: InverseCovariance | None
-    exact_known: bool  # the noise of pixels is independent, and the sky beyond lmax not shown, or pooled
-    sky_power: Cl  # of s^: E|s^_lm|^2 / C_l = C_l / (C_l + N_l) in the isotropic approximation
-    settings: DiagnosisSettings
-    #: s^ is that of the mean of all maps, and what they have alike beside it is sky beyond lmax, of this variance, uK^2
-    pooled: float = 0.0
-    tolerance: float = 1.0  # of the inverse covariance, over that of the settings
-    bright: bool = False  # the maps show the sky beyond lmax
-
-    @property
-    def frame(self) -> str:
-        """Return the frame of the maps."""
-        return self.survey.frame
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """Return the names of the channels."""
-        return tuple(channel.name for channel in self.survey.channels)
-
-    @cached_property
-    def inverse_cl(self) -> Cl:
-        """Return 1/C_l, zero where C_l is, uK^-2."""
-        return divided(1.0, self.cl)
-
-    @cached_property
-    def last_degrees(self) -> NDArray[np.int64]:
-        """Return the last degree at which orders s of each channel's beam are measured, (channel, beam_orders + 1).
-
-        Beyond it there is less than TAIL of the squared S/N of a change of B_l by (l / lmax)^s: the sky is below the
-        noise there, or the beam has taken it away. It is lmax where an earlier end would save little.
-        """
-        ell = np.arange(self.lmax + 1.0)
-        powers = (ell / max(self.lmax, 1)) ** (2 * np.arange(self.settings.beam_orders + 1.0)[:, None])
-        squared = (2.0 * ell + 1.0) * self.cl * self.sky_power * self.response[:, None] ** 2 * powers
-        beyond = np.cumsum(squared[..., ::-1], axis=-1)[..., ::-1]
-        last = np.maximum(np.sum(beyond >= TAIL * beyond[..., :1], axis=-1) - 1, min(self.lmax, EARLIEST))
-        little = (last + 1.0) ** 2 > (1.0 - SAVED) * (self.lmax + 1.0) ** 2
-        return np.where(little, self.lmax, last)
-
-    @cached_property
-    def alike(self) -> tuple[tuple[Cl, tuple[int, ...]], ...]:
-        """Return the different responses, each with the indices of all maps that have it."""
-        rows, which = np.unique(self.response, axis=0, return_inverse=True)
-        groups = (np.flatnonzero(which.ravel() == row) for row in range(len(rows)))
-        return tuple((row, sum(map(self.of, group.tolist()), ())) for row, group in zip(rows, groups, strict=True))
-
-    @cached_property
-    def hides(self) -> bool:
-        """Return True if a map lacks a part of the sky that is more than little."""
-        return hidden_share(self.parts) >= self.settings.hidden_share
-
-    @cached_property
-    def masks(self) -> tuple[Map, ...]:
-        """Return the weights that the preparation has multiplied every map with; 0 also where others are smeared in."""
-        each = (None if one is None else one.weight(sharp=True) for one in self.survey.preparations)
-        pairs = zip(self.parts, each, strict=True)
-        return tuple(np.ones(part.precision.size) if own is None else own for part, own in pairs)
-
-    @cached_property
-    def unmasked(self) -> "Model | None":
-        """Return the model with the inverse covariance of maps over their masks, as if their noise were white.
-
-        To an isotropic filter zeros in a mask are data: skies that filtered maps constrain had many times their power
-        at high degrees. None: nothing is hidden, or the maps show the sky beyond lmax, or far above the noise there.
-        """
-        if not self.hides or self.bright or self.sky_power[self.lmax] > SHARP / (1.0 + SHARP):
-            return None
-        templates = templates_of(self.survey.preparations)
-        parts = []
-        for part, mask, own in zip(self.parts, self.masks, templates, strict=True):
-            subtracted = () if own is None else ((divided(own, mask), part.precision),)
-            parts.append(replace(part, precision=part.precision * mask**2, subtracted=subtracted))
-        return replace(self, inverse=inverse_of(self.cl, self.response, parts))
-
-    @cached_property
-    def exact(self) -> "Model":
-        """Return the model with the inverse covariance of all maps, samples' offsets included, if it is known."""
-        if self.pooled or not self.exact_known:
-            return self
-        parts = marginalised(self.survey, self.parts)
-        inverse = inverse_of(self.cl, self.response, parts, offsets=True)
-        return replace(self, parts=parts, inverse=inverse, tolerance=CAREFUL)
-
-    def of(self, channel: int) -> tuple[int, ...]:
-        """Return the indices of the channel's maps."""
-        return tuple(i for i, part in enumerate(self.parts) if part.channel == channel)
+from mcsim.support.arrays import Alm, Map, divided
 
 
 @dataclass(frozen=True)
@@ -170,163 +48,6 @@ class FilteredMaps:
     difference: NDArray[np.float64]  # u^2 - 1 of every pixel, (channel, npix): pixel_noise.fill_difference
     squares: NDArray[np.float64]  # N_i r_i^2 summed over maps, (channel, npix): pixel_noise.add_squares
     mean: Map | None = None  # residual of the mean of pooled maps, uK^-1, (npix,)
-
-
-def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
-    """Prepare a survey for the filter; raise InputError unless it has power of the sky, and pixels.
-
-    Of a channel that reads differences of two beams, the filter knows the mean of both sides.
-    """
-    if survey.cl is None or not survey.cl[2:].any():
-        raise InputError("a diagnosis needs the spectrum of the sky, with power from l = 2 on; give sky.spectrum.")
-    run = survey.config
-    if run.map.grid == "gl":
-        raise InputError('a diagnosis compares maps of pixels; give the model map.grid = "healpix" and map.nside.')
-    both = zip(survey.channels, survey.making.channels, strict=True)
-    response = np.stack([_circular(channel, made) for channel, made in both])
-    parts = []
-    for index, channel in enumerate(survey.channels):
-        floor = settings.noise_floor * float(np.sqrt(sky_variance(survey.cl, response[index])))
-        for m, split in zip(channel.maps, run.map.each_split, strict=True):
-            if isinstance(m.drawn, NoiseOfFiles):
-                raise InputError(
-                    f"the noise of map {m.name} is read from files, of which a diagnosis would need thousands; "
-                    'describe it by noise of kind "white", "depth", "variance", "difference" or "correlated".'
-                )
-            seen = m.moments.hits > 0
-            if m.weight is not None:
-                seen = seen & (m.weight > 0)
-            variance = np.broadcast_to(floor**2 + (0.0 if m.noise_uk is None else m.noise_uk**2), seen.shape)
-            if np.any(variance[seen] == 0.0):
-                raise InputError(
-                    f"noise_floor = {settings.noise_floor:g}, but map {m.name} has pixels without noise; give more "
-                    "than 0, or the map noise."
-                )
-            precision = np.where(seen, 1.0 / variance, 0.0)
-            noise_power = 4 * np.pi / seen.size * float(np.mean(1.0 / precision[seen]))
-            parts.append(Part(index, m.name, split, m.moments, precision, noise_power))
-    snr = survey.cl * sum(response[part.channel] ** 2 / part.noise_power for part in parts)
-    lmax = _highest_degree(survey, snr)
-    pixels = all(m.preparation is None or m.preparation.keeps_noise_white for m in survey.maps)
-    white = pixels and all(m.drawn is None and m.pairs is None for m in survey.maps)
-    bright = bool(np.any(snr[lmax + 1 :] > 1.0))
-    unresolved = (np.arange(snr.size) > lmax) * np.sqrt(survey.cl) * response
-    cl, response, snr = survey.cl[: lmax + 1], response[:, : lmax + 1], snr[: lmax + 1]
-    known, inverse = pixels and not bright and bool(snr[lmax] <= SHARP), None
-    if known and hidden_share(parts) >= settings.hidden_share:
-        parts = list(marginalised(survey, parts))
-        inverse = inverse_of(cl, response, parts)
-    maps = survey.nside, cl, response, tuple(parts), dipole_alm(survey.channels[0].site.dipole_uk, lmax)
-    model = Model(survey, lmax, *maps, inverse, known and white, snr / (1.0 + snr), settings, bright=bright)
-    return replace(_pooled(model, unresolved), exact_known=white) if pixels and bright else model
-
-
-def hidden_share(parts: Sequence[Part]) -> float:
-    """Return the share of the sky that the map which lacks most of it does not show."""
-    return max(float(np.mean(part.precision == 0.0)) for part in parts)
-
-
-def _pooled(model: Model, unresolved: Matrix) -> Model:
-    """Return a model with the inverse covariance of the mean of all maps, which show the sky beyond lmax.
-
-    ``unresolved``: the amplitude of this sky in every channel, sqrt(C_l) B_l w_l, uK, shape (channel, sky.lmax + 1). In
-    the mean it is noise, independent from pixel to pixel. What a beam makes of it otherwise than the others is noise of
-    its own maps.
-    """
-    shared = _mean(unresolved, model.parts)
-    own, alike = [_variance(one - shared) for one in unresolved], _variance(shared)
-    parts = [
-        replace(part, precision=part.precision / (1.0 + own[part.channel] * part.precision), subtracted=tuple(one))
-        for part, one in zip(model.parts, regressions(model.survey.preparations), strict=True)
-    ]
-    response, precision = _mean(model.response, model.parts), _precision(parts, alike)
-    snr = model.cl * response**2 * precision.sum() / (4.0 * np.pi)
-    return replace(
-        model,
-        parts=tuple(parts),
-        inverse=_of_mean(model.cl, response, precision),
-        sky_power=snr / (1.0 + snr),
-        pooled=alike,
-        tolerance=CAREFUL,
-    )
-
-
-def _mean(rows: Matrix, parts: Sequence[Part]) -> Vector:
-    """Return the mean over all maps of what every channel has, shape (channel, n): (n,)."""
-    weights = [1.0 / part.noise_power for part in parts]
-    return np.asarray(np.average([rows[part.channel] for part in parts], axis=0, weights=weights))
-
-
-def _of_mean(cl: Cl, response: Vector, precision: Map) -> InverseCovariance:
-    return InverseCovariance(cl, [ObservedMap(convolve.Response(response[None].astype(np.complex128)), precision)])
-
-
-def _precision(parts: Sequence[Part], alike: float) -> Map:
-    """Return the inverse variance of the mean of all maps, which have more of this variance alike, uK^-2, (npix,)."""
-    total = np.sum([part.precision for part in parts], axis=0)
-    return np.asarray(total / (1.0 + alike * total))
-
-
-def seen_through(model: Model, response: Matrix) -> Model:
-    """Return the model if its channels see the sky through another response, shape (channel, lmax + 1)."""
-    inverse = model.inverse
-    if model.pooled:
-        inverse = _of_mean(model.cl, _mean(response, model.parts), _precision(model.parts, model.pooled))
-    elif inverse is not None:
-        inverse = inverse_of(model.cl, response, model.parts)
-    return replace(model, response=response, inverse=inverse)
-
-
-def inverse_of(cl: Cl, response: Matrix, parts: Sequence[Part], offsets: bool = False) -> InverseCovariance:
-    """Return the inverse covariance of all maps, of the circular parts of their beams.
-
-    They are those at the centres of pixels, or, with ``offsets``, at the means of their samples. Of what is subtracted
-    parts are :func:`marginalised`, or know nothing.
-    """
-    through, observed = [convolve.Response(row[None].astype(np.complex128)) for row in response], []
-    for part in parts:
-        templates = part.subtracted[0][0] if part.subtracted else None
-        moments = part.moments if offsets else None
-        observed.append(ObservedMap(through[part.channel], part.precision, moments, templates))
-    return InverseCovariance(cl, observed)
-
-
-def _highest_degree(survey: Survey, snr: Cl) -> int:
-    """Return the highest degree of the filters from the sky's power over the noise's in all maps, (sky.lmax + 1,).
-
-    Notes
-    -----
-    It is ``biposh.lmax``, or on to where the maps no longer show the sky if their pixels hold it so far. From 2.2 nside
-    on quadrature leaks 2 % of the power, and pixels average the sky in ways that no single window tells: little beside
-    noise. A sky that is above the noise beyond 2.5 nside is filtered up to the degree that the run chooses, and so are
-    prepared maps, whose noise is not white and whose pixels may be degraded.
-    """
-    last = min(snr.size - 1, 5 * survey.nside // 2)
-    if not keeps_pixels(survey.preparations) or np.any(snr[last + 1 :] > 1.0):
-        return survey.lmax
-    return max(survey.lmax, int(np.flatnonzero(snr[: last + 1] >= FAINT).max(initial=0)))
-
-
-def _circular(channel: Channel, made: Channel) -> Cl:
-    """Return B_l w_l of a channel; of a differencing scan their mean over both sides.
-
-    ``made`` is the channel before its maps are prepared.
-    """
-    own = channel.response.factors[0].real
-    if made.side_b is None:
-        return own
-    a, b = made.response.factors[0].real, made.side_b.response.factors[0].real
-    return np.asarray(own * np.divide(0.5 * (a + b), a, out=np.ones_like(a), where=a != 0.0))
-
-
-def sky_variance(cl: Cl, response: Cl) -> float:
-    """Return the variance over the sky of a spectrum seen through B_l, in its unit."""
-    return _variance(np.sqrt(cl) * response)
-
-
-def _variance(root: Cl) -> float:
-    """Return the variance over the sky of a signal, given the root of its spectrum."""
-    return float(np.sum((2 * np.arange(root.size) + 1) / (4 * np.pi) * root**2))
 
 
 def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
@@ -425,15 +146,16 @@ def filtered_sky(model: Model, clean: Sequence[Map], careful: bool = False) -> A
     if model.inverse is not None:
         maps = divided(*_summed(model, clean))[None] if model.pooled else np.stack(clean)
         weighted = model.inverse.adjoint(model.inverse.weighted(maps))
-        tolerance = settings.filter_tolerance * model.tolerance * (0.01 if careful else 1.0)
-        return model.inverse.approach(weighted, tolerance, settings.filter_iterations)
+        tolerance, most = settings.filter_tolerance * model.tolerance, settings.filter_iterations
+        found = model.inverse.approach(weighted, *((0.01 * tolerance, 10 * most) if careful else (tolerance, most)))
+        return found if model.share is None else alm_.multiply(found, model.share, lmax)
     total = np.zeros(alm_.size(lmax), dtype=np.complex128)
     gain = np.zeros(lmax + 1)
     # Channels that see the sky alike are analysed together.
-    for response, members in model.alike:
+    for response, colour, members in model.alike:
         together = reduce(np.add, [clean[i] / model.parts[i].noise_power for i in members])
-        total += alm_.multiply(healpix.analysis(together, lmax, int(careful)), response, lmax)
-        gain += response**2 * sum(1.0 / model.parts[i].noise_power for i in members)
+        total += alm_.multiply(healpix.analysis(together, lmax, int(careful)), response / colour, lmax)
+        gain += response**2 / colour * sum(1.0 / model.parts[i].noise_power for i in members)
     return alm_.multiply(total, model.cl / (1.0 + model.cl * gain), lmax)
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from mcsim import config
 from mcsim.datavector.analysis import simulated_maps
 from mcsim.datavector.campaign import constrained_jobs
+from mcsim.datavector.filter_model import sky_variance
 from mcsim.datavector.same_skies import SameSkies
-from mcsim.datavector.wiener_filter import sky_variance
 from mcsim.reconstruction import words
 from mcsim.reconstruction.fitted_nuisances import SKIES, Marginal
 from mcsim.reconstruction.plugin import Plugin, plugin

@@ -16,8 +16,9 @@ from scipy.sparse import csr_matrix, diags
 from mcsim import config
 from mcsim.datavector.analysis import Analysis, Job, Kinds, analysis_for, simulated_maps
 from mcsim.datavector.campaign import Ask, in_tasks, seeded
+from mcsim.datavector.filter_model import Model, sky_variance
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import FilteredMaps, Model, sky_variance, wiener_filter
+from mcsim.datavector.wiener_filter import FilteredMaps, wiener_filter
 from mcsim.instrument.scan import MapGrid
 from mcsim.instrument.scan.model import SECONDS_PER_DAY
 from mcsim.reconstruction import sources
@@ -82,8 +83,8 @@ CODE = (
     *("config", "sphere", "instrument", "systematics", "bipolar", "simulation"),
     *(f"reconstruction.{name}" for name in ("choices", "forms", "periods", "scores", "simulated_scores", "sources")),
     "reconstruction.sky_changes",
-    *(f"datavector.{name}" for name in ("analysis", "matched_filters", "parts", "pixel_noise", "shared_sky")),
-    *("datavector.untouched_maps", "datavector.wiener_filter"),
+    *(f"datavector.{name}" for name in ("analysis", "filter_model", "matched_filters", "parts", "pixel_noise")),
+    *("datavector.shared_sky", "datavector.untouched_maps", "datavector.wiener_filter"),
 )
 """What scores of simulations are computed with."""
 

@@ -26,8 +26,6 @@ from mcsim.support.arrays import Map
 from mcsim.support.loading import once_per_content
 from mcsim.systematics import Site
 
-SMEARED = 0.07  #: of the weight of a pixel that a step in harmonics has changed
-
 LARGEST_GAIN = 10.0  #: of B_l by a change of the beam: a target that asks for more is narrower than the beam
 
 
@@ -133,20 +131,26 @@ class Preparation:
                 found = [(np.stack(list(map(step.apply, one))), step.local(weight)) for one, weight in found]
         return [(np.nan_to_num(columns), np.nan_to_num(weight)) for columns, weight in found]
 
-    def weight(self, sharp: bool = False) -> Map | None:
-        """Return the product of the masks of the steps in the prepared pixels; None without one.
+    def weight(self) -> Map | None:
+        """Return the product of the masks of the steps in the prepared pixels; None without one."""
+        return self._weight()[0]
 
-        ``sharp``: 0 where a step in harmonics has smeared it by more than SMEARED.
-        """
+    def smeared(self) -> Map:
+        """Return the largest change of that weight by a step in harmonics, shape (npix,); 0 without a mask."""
+        return self._weight()[1]
+
+    def _weight(self) -> tuple[Map | None, Map]:
         weight: Map | None = None
+        smeared = np.zeros(12 * self.nside**2)
         for step in self.steps:
             if isinstance(step, Weighted):
                 weight = step.mask if weight is None else weight * step.mask
             elif weight is not None and not isinstance(step, Filled):
                 before, weight = weight, step.local(weight)
-                if sharp and step.transforms:
-                    weight = np.where(np.abs(step.apply(before) - weight) > SMEARED, 0.0, weight)
-        return weight
+                smeared = step.local(smeared) if smeared.any() else np.zeros(weight.size)
+                if step.transforms:
+                    smeared = np.maximum(smeared, np.abs(step.apply(before) - weight))
+        return weight, smeared
 
     def moments(self, moments: Moments) -> Moments:
         """Return hits, sums over the prepared pixels, and orientation moments, plain means as of the temperatures."""

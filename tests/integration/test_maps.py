@@ -12,9 +12,9 @@ from astropy.io import fits
 from distributed import Client
 
 from mcsim import config, open_ensemble
+from mcsim.datavector.filter_model import model_of
 from mcsim.datavector.map_checks import of_pixel_means, read_maps
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import model_of
 from mcsim.ensemble import maps as maps_
 from mcsim.ensemble import runner
 from mcsim.ensemble.maps import write_map, write_maps

@@ -12,9 +12,9 @@ import mcsim
 from instruments import data_of, two_channels
 from mcsim import config, systematics
 from mcsim.datavector.analysis import Analysis, analysis_of
+from mcsim.datavector.filter_model import model_of
 from mcsim.datavector.map_checks import read_maps
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import model_of
 from mcsim.diagnosis import api
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey

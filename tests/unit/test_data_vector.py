@@ -9,10 +9,11 @@ import pytest
 from instruments import two_channels
 from mcsim import config
 from mcsim.datavector.analysis import analysis_of
+from mcsim.datavector.filter_model import model_of
 from mcsim.datavector.map_checks import checked_map
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element, blocks_of, pair_classes, ranges_within
-from mcsim.datavector.wiener_filter import model_of, wiener_filter
+from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.systematics import catalogue

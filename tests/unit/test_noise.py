@@ -8,9 +8,9 @@ import pytest
 
 from layouts import table
 from mcsim import config
+from mcsim.datavector.filter_model import model_of
 from mcsim.datavector.map_checks import read_maps
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import model_of
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import header, healpix

@@ -7,7 +7,7 @@ import pytest
 import mcsim
 from layouts import table
 from mcsim import config
-from mcsim.datavector.wiener_filter import model_of
+from mcsim.datavector.filter_model import model_of
 from mcsim.ensemble import plan
 from mcsim.ensemble.expectation import noise_mean
 from mcsim.simulation import simulate

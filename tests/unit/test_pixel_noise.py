@@ -7,9 +7,10 @@ import pytest
 
 from mcsim import config
 from mcsim.datavector import pixel_noise
+from mcsim.datavector.filter_model import Model, model_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import blocks_of
-from mcsim.datavector.wiener_filter import Model, model_of, wiener_filter
+from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 

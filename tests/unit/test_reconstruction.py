@@ -11,8 +11,9 @@ import pytest
 
 from instruments import two_channels
 from mcsim import config, reconstruction, systematics
+from mcsim.datavector.filter_model import model_of
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import model_of, wiener_filter
+from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.diagnosis import api
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import MapGrid

@@ -9,8 +9,9 @@ import pytest
 
 from instruments import two_channels
 from mcsim import config
+from mcsim.datavector.filter_model import Model, model_of
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import Model, model_of, wiener_filter
+from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.reconstruction import simulated_scores
 from mcsim.reconstruction.forms import InTime
 from mcsim.reconstruction.grammar import structures

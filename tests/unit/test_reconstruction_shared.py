@@ -7,8 +7,9 @@ import pytest
 
 from instruments import two_channels
 from mcsim import config
+from mcsim.datavector.filter_model import model_of
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.wiener_filter import model_of, wiener_filter
+from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.reconstruction import simulated_scores, words
 from mcsim.reconstruction.grammar import structures
 from mcsim.reconstruction.plugin import plugin
