@@ -168,7 +168,7 @@ class DataSet(ABC, Generic[Data]):
         """Return the effects in groups of which each is simulated in the same skies."""
         return [list(found)]
 
-    def rescaled(self, found: Sequence[config.Effect]) -> bool:
+    def changes_sky(self, found: Sequence[config.Effect]) -> bool:
         """Return True if responses to effects depend on what these have done to the sky that the data are of."""
         return False
 

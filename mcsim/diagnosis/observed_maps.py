@@ -108,13 +108,14 @@ class ObservedMaps(DataSet[Sequence[Map]]):
             groups[self.same_skies.skies_of(effect) == "reference"].append(effect)
         return [own for own in groups if own]
 
-    def rescaled(self, found: Sequence[config.Effect]) -> bool:
+    def changes_sky(self, found: Sequence[config.Effect]) -> bool:
         """Return True if the observed sky has to be found as effects let the channels see it, or is not isotropic."""
         return any(self.same_skies.seen(found)) or any(map(self.same_skies.is_pattern, found))
 
     def dipole_snr(self, found: Sequence[config.Effect]) -> float:
         """Return the S/N of the dipole that effects leave in the only channel, 0 with several, by noise alone."""
-        noise = 1.0 / sum(1.0 / part.noise_power for part in self.context.analysis.model.parts)  # of a_lm, uK^2 sr
+        model = self.context.analysis.model
+        noise = model.colours[0, 1] / sum(1.0 / part.noise_power for part in model.parts)  # of a_1m, uK^2 sr
         left = np.linalg.norm(self.same_skies.dipole_left_uk(found))
         return float(left / np.sqrt(3.0 / (4.0 * np.pi) * noise))
 

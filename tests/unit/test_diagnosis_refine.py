@@ -88,7 +88,7 @@ class Instrument:
         context = SimpleNamespace(
             null=self.null, templates=self.t, calibration=self.calibration, bank=bank, settings=self.settings
         )
-        own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter, "rescaled": lambda tables: False}
+        own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter, "changes_sky": lambda tables: False}
         own["dipole_snr"] = lambda tables: float(tables[0].channel in self.crossed)
         groups = self.null.whiten_groups(self.t, [one.columns for one in self.candidates])
         gap = global_test(self.null, x, groups, self.calibration)
