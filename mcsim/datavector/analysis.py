@@ -321,10 +321,10 @@ def simulated_maps(job: Job, library: Library | None = None) -> Iterator[list[Ma
         if job.sample_by_sample:
             yield [map_uk for _, map_uk in sampled.maps(shared, realization, epsilon=_EPSILON)]
             continue
-        sky, observed = None, b"" if job.observed is None else job.observed.tobytes()
-        if observed:
+        sky = None
+        if job.observed is not None:
             seed, _ = _seed_and_added(job.simulated, job.fiducial)
-            sky = _constrained_sky(job.definition, observed, seed, realization)
+            sky = _constrained_sky(job.definition, job.observed, seed, realization)
         if job.source is not None:
             yield external_maps(job, realization, sky)
         elif job.nuisances:
@@ -333,7 +333,7 @@ def simulated_maps(job: Job, library: Library | None = None) -> Iterator[list[Ma
             which = (
                 without_effects(job.simulated),
                 job.library if library is None else kinds_of(library),
-                hash(observed),
+                0 if job.observed is None else hash(job.observed.tobytes()),
                 job.content,
             )
             yield _untouched().maps(shared, realization, sky, which)
@@ -378,24 +378,36 @@ def _disturbed(simulated: str, kinds: Kinds, fiducial: str, content: str) -> Dis
     return DisturbedSurvey.of(config.from_json(simulated), dict(kinds))
 
 
-@lru_cache(maxsize=48)  # as many as are drawn for the scatter of a stochastic effect, again and again
-def _constrained_sky(definition: tuple[Any, ...], observed: bytes, seed: int, realization: int) -> Alm:
+def _constrained_sky(definition: tuple[Any, ...], observed: Alm, seed: int, realization: int) -> Alm:
     """Return a constrained realization: a sky s + (s^_data - s^_drawn), with s^_drawn filtered from maps of s.
 
     Notes
     -----
-    Hoffman & Ribak, ApJ 380, L5 (1991). The noise of these maps is independent of that of the realization itself:
-    otherwise sky and noise would be correlated, and every response too small by the filter of s^. A sky is drawn in the
-    frame in which maps are made; s^ is in that of the prepared ones.
+    Hoffman & Ribak, ApJ 380, L5 (1991).
+    """
+    return np.asarray(_drawn_sky(definition, seed, realization) + _as_made(_analysis(*definition).model, observed))
+
+
+@lru_cache(maxsize=48)  # as many as are drawn for the scatter of a stochastic effect, again and again
+def _drawn_sky(definition: tuple[Any, ...], seed: int, realization: int) -> Alm:
+    """Return a sky of the model without what is filtered from maps of it.
+
+    The noise of these maps is independent of that of the realization itself: otherwise sky and noise would be
+    correlated, and every response too small by the filter of s^.
     """
     model = _analysis(*definition).model
     run = model.survey.config
     drawn = replace(model.survey, config=replace(run, ensemble=replace(run.ensemble, seed=seed)))
     sky = simulate.draw_sky(drawn, realization)
     filtered = shared_sky(model, list(simulate.maps(drawn, realization + _OTHER_NOISE, sky=sky)))
-    difference = np.frombuffer(observed, dtype=np.complex128) - filtered
-    found = rotation.rotate_alm(difference, model.lmax, model.frame, run.map.frame)
-    return np.asarray(sky + alm_.resize(found, model.lmax, run.sky.lmax))
+    return np.asarray(sky - _as_made(model, filtered))
+
+
+def _as_made(model: Model, filtered: Alm) -> Alm:
+    """Return a filtered sky, of prepared maps, in the frame and up to the degree in which maps are made."""
+    run = model.survey.config
+    turned = rotation.rotate_alm(filtered, model.lmax, model.frame, run.map.frame)
+    return alm_.resize(turned, model.lmax, run.sky.lmax)
 
 
 @lru_cache(maxsize=2)

@@ -62,6 +62,7 @@ class Model:
     pooled: float = 0.0
     tolerance: float = 1.0  # of the inverse covariance, over that of the settings
     bright: bool = False  # the maps show the sky beyond lmax
+    least: Vector | None = None  #: :attr:`white`, if the maps are seen through another response
     share: Cl | None = None  # of the sky in what the inverse covariance finds, if noise is in it
 
     @property
@@ -124,27 +125,34 @@ class Model:
         return tuple(masks)
 
     @cached_property
+    def white(self) -> Vector:
+        """Return the white part of the noise that :attr:`unmasked` knows, over that of pixels, shape (channel,).
+
+        It is that of the degrees that the sky is seen at, and more where it is far above the noise: RANGE and SHARP.
+        """
+        if self.least is not None:
+            return self.least
+        shown = (self.response > 0.0) & (self.sky_power > FAINT / (1.0 + FAINT))
+        snr = self.cl * self._weight(self.colours)
+        least = np.min(self.colours, axis=1, where=shown, initial=self.colours.max())
+        return np.maximum(least, np.max(snr * self.colours, axis=1) / RANGE) * max(snr[self.lmax] / SHARP, 1.0)
+
+    @cached_property
     def unmasked(self) -> "Model | None":
         """Return the model with the inverse covariance of maps over their masks, as if their noise were independent.
 
         Noise that is more at some degrees than at others is white noise and a sky of its own, with which it is found.
         To an isotropic filter zeros in a mask are data: skies that filtered maps constrain had many times their power
-        at high degrees. Of maps that show the sky beyond lmax it is that of their mean. None: nothing is hidden, or the
-        maps show the sky up to lmax alone, and far above the noise there.
+        at high degrees. Of maps that show the sky beyond lmax it is that of their mean. None: nothing is hidden.
         """
         if not self.hides:
             return None
-        templates = templates_of(self.survey.preparations)
-        shown = (self.response > 0.0) & (self.sky_power > FAINT / (1.0 + FAINT))
-        snr = self.cl * self._weight(self.colours)
-        least = np.min(self.colours, axis=1, where=shown, initial=self.colours.max())
-        least = np.maximum(least, np.max(snr * self.colours, axis=1) / RANGE) * max(snr[self.lmax] / SHARP, 1.0)
-        parts = []
+        parts, templates = [], templates_of(self.survey.preparations)
         for part, mask, own in zip(self.parts, self.masks, templates, strict=True):
             subtracted = () if own is None else ((divided(own, mask), part.precision),)
-            precision = part.precision * mask**2 / least[part.channel]
+            precision = part.precision * mask**2 / self.white[part.channel]
             parts.append(replace(part, precision=precision, subtracted=subtracted))
-        noise, white = (divided(1.0, self._weight(rows)) for rows in (self.colours, least[:, None]))
+        noise, white = (divided(1.0, self._weight(rows)) for rows in (self.colours, self.white[:, None]))
         total = self.cl + np.where(noise > (1.0 + LITTLE) * white, noise - white, 0.0)
         model = replace(self, cl=total, parts=tuple(parts), share=divided(self.cl, total))
         return _pooled(model) if self.bright else replace(model, inverse=inverse_of(total, self.response, parts))
@@ -287,7 +295,7 @@ def seen_through(model: Model, response: Matrix) -> Model:
         inverse = _of_mean(model.cl, _mean(response, model.parts), _precision(model.parts, model.pooled))
     elif inverse is not None:
         inverse = inverse_of(model.cl, response, model.parts)
-    return replace(model, response=response, inverse=inverse)
+    return replace(model, response=response, inverse=inverse, least=model.white)
 
 
 def inverse_of(cl: Cl, response: Matrix, parts: Sequence[Part], offsets: bool = False) -> InverseCovariance:
