@@ -5,7 +5,8 @@ With d_i the maps, P_i the fiducial response of map i (beam, pixel window, centr
     s^ = (S^-1 + sum_i P_i^t N_i^-1 P_i)^-1 sum_i P_i^t N_i^-1 d_i,     r_i = N_i^-1 (d_i - P_i s^).
 
 On the full sky the first inverse is taken as if noise were isotropic, which costs little. Behind a mask it would cost
-much, and is that of the noise of every pixel, by conjugate gradients (Model.inverse). What describes unlisted effects
+much, and is that of the noise of every pixel, by conjugate gradients (Model.inverse), or that of maps over their masks
+where noise is not independent from pixel to pixel (Model.unmasked). What describes unlisted effects
 has it on every sky, with the offsets of the samples (Model.exact). Maps that show the sky beyond the filter's last
 degree are filtered by the inverse covariance of their mean, in which that sky is noise of pixels, and what all of them
 have alike in a pixel is taken for sky (Model.pooled): the isotropic filter leaves it in all residuals, and most effects
@@ -54,6 +55,7 @@ def wiener_filter(model: Model, maps: Sequence[Map]) -> FilteredMaps:
     """Filter maps of all parts, uK, shape (npix,) each; ``healpy.UNSEEN`` or NaN is not observed."""
     lmax, top = model.lmax, model.settings.beam_orders
     clean, seen = cleaned(model, maps)
+    model, clean = over_masks(model, clean)
     sky = filtered_sky(model, clean)
     looked_at = sky + model.dipole
     expected, mean = _expected(model, clean, sky)
@@ -138,6 +140,13 @@ def cleaned(model: Model, maps: Sequence[Map]) -> tuple[list[Map], list[NDArray[
             smooth = healpix.synthesis(through[None], model.nside, model.lmax)[0]
             clean[i] = np.where(hole, smooth, clean[i])
     return [part.without_subtracted(map_) for part, map_ in zip(model.parts, clean, strict=True)], seen
+
+
+def over_masks(model: Model, clean: list[Map]) -> tuple[Model, list[Map]]:
+    """Return :attr:`Model.unmasked` and clean maps over their masks; both as they are if the model knows the masks."""
+    if model.inverse is not None or model.unmasked is None:
+        return model, clean
+    return model.unmasked, [divided(*one) for one in zip(clean, model.masks, strict=True)]
 
 
 def filtered_sky(model: Model, clean: Sequence[Map], careful: bool = False) -> Alm:
