@@ -356,15 +356,18 @@ class Refiner:
         alone = bool(found.explanations) and len(found.explanations[0].members) == 1
         tried = 0 if alone else self.context.settings.tried
         explained = np.array([single.delta_chi2 for single in found.singles])
-        tried = min(max(tried, int(np.sum(explained >= NEARLY * explained.max()))), 2 * tried)
         ranked = [int(index) for index in np.argsort(-explained)]
+        # Squares of maps, which a strong effect makes, are fitted best by responses that no effect can have so large.
+        fits = [(single.amplitudes, single.covariance) for single in found.singles]
+        inside = [one for one in ranked if candidates[one].beyond(*fits[one]) == 0.0]
+        best = {one for among in (ranked, inside) for one in _nearly_best(explained, among, tried)}
         stochastic = {candidates[index].identity for index in work if candidates[index].parametrization.stochastic}
-        for place, index in enumerate(ranked):
+        for index in ranked:
             single, candidate = found.singles[index], candidates[index]
             pvalue = float(self.context.calibration.global_pvalue(single.nested_pvalue))
             detected = candidate.parametrization.stochastic and pvalue <= self.context.settings.stochastic_level
             detected = detected and (not alone or self._may_suffice(candidate, single))
-            if place < tried or (detected and candidate.identity not in stochastic):
+            if index in best or (detected and candidate.identity not in stochastic):
                 work.setdefault(index, (index, single.amplitudes, single.covariance))
                 if candidate.parametrization.stochastic:
                     stochastic.add(candidate.identity)
@@ -405,6 +408,12 @@ def _steepness(before: tuple[Vector, Vector], now: tuple[Vector, Vector], covari
     moved, fitted = now[0] - before[0], now[1] - before[1]
     size = float(moved @ precision @ moved)
     return float(np.clip(-(moved @ precision @ fitted) / size, 0.0, STEEPEST)) if size > 0.0 else 0.0
+
+
+def _nearly_best(explained: Vector, ranked: Sequence[int], least: int) -> Sequence[int]:
+    """Return the first of a ranking that explain nearly as much as the best: as many as ``least``, or up to twice."""
+    nearly = sum(explained[one] >= NEARLY * explained[ranked[0]] for one in ranked)
+    return ranked[: min(max(least, int(nearly)), 2 * least)]
 
 
 def _size(found: Attribution) -> int:

@@ -9,7 +9,7 @@ import pytest
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.partial import PartialSearch
-from mcsim.diagnosis.refine import Refiner
+from mcsim.diagnosis.refine import Refiner, _nearly_best
 from mcsim.diagnosis.selection import attribute
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import SimulatedGaussian
@@ -390,3 +390,12 @@ def test_what_was_simulated_far_away_in_a_set_is_tried_at_the_amplitude_that_it_
     (own,) = [one for one in found.explanations if one.members == (0,)]
     assert own.fit.amplitudes == pytest.approx([15.0], abs=0.3)
     assert {one.members for one in found.explanations} == {(0,), (2,)}
+
+
+def test_those_that_explain_nearly_as_much_as_the_best_are_tried_up_to_twice_as_many() -> None:
+    explained = np.array([10.0, 9.0, 8.5, 8.1, 7.0, 1.0])
+    assert list(_nearly_best(explained, [0, 1, 2, 3, 4, 5], 2)) == [0, 1, 2, 3]
+    assert list(_nearly_best(explained, [4, 5], 2)) == [4, 5]
+    assert list(_nearly_best(explained, [1, 5], 1)) == [1]
+    assert list(_nearly_best(explained, [], 2)) == []
+    assert list(_nearly_best(explained, [0, 1], 0)) == []
