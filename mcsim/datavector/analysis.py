@@ -28,7 +28,7 @@ from mcsim.simulation.survey import Survey, survey
 from mcsim.simulation.timestream import CorrelatedNoise
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import rotation
-from mcsim.support.arrays import Alm, Map, Vector
+from mcsim.support.arrays import Alm, Cl, Map, Vector
 from mcsim.systematics import Effect, Library, acts_through
 
 Kinds = tuple[tuple[str, type[Effect]], ...]  #: effects of a library by name, as they are sent to workers
@@ -288,6 +288,7 @@ class Job:
     bipolar_scan: bool = False  # measure the bipolar scan and the coarse residual maps as well
     slices: bool = False  # measure the numbers beside the data vector as well
     observed: Alm | None = None  # filtered sky of the data, which then constrains the skies
+    spread: Cl | None = None  # of skies about the observed one, over that without effects, by degree: (lmax + 1,)
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
     library: Kinds = field(default_factory=lambda: kinds_of(None))
     source: Source | None = None  # simulates in place of mcsim
@@ -324,7 +325,7 @@ def simulated_maps(job: Job, library: Library | None = None) -> Iterator[list[Ma
         sky = None
         if job.observed is not None:
             seed, _ = _seed_and_added(job.simulated, job.fiducial)
-            sky = _constrained_sky(job.definition, job.observed, seed, realization)
+            sky = _constrained_sky(job.definition, job.observed, seed, realization, job.spread)
         if job.source is not None:
             yield external_maps(job, realization, sky)
         elif job.nuisances:
@@ -378,14 +379,21 @@ def _disturbed(simulated: str, kinds: Kinds, fiducial: str, content: str) -> Dis
     return DisturbedSurvey.of(config.from_json(simulated), dict(kinds))
 
 
-def _constrained_sky(definition: tuple[Any, ...], observed: Alm, seed: int, realization: int) -> Alm:
+def _constrained_sky(
+    definition: tuple[Any, ...], observed: Alm, seed: int, realization: int, spread: Cl | None = None
+) -> Alm:
     """Return a constrained realization: a sky s + (s^_data - s^_drawn), with s^_drawn filtered from maps of s.
 
     Notes
     -----
-    Hoffman & Ribak, ApJ 380, L5 (1991).
+    Hoffman & Ribak, ApJ 380, L5 (1991). ``spread`` multiplies each degree of s - s^_drawn: where effects of the data
+    hide or show more of the sky, it is known worse or better than from the maps that s^_drawn is filtered from.
     """
-    return np.asarray(_drawn_sky(definition, seed, realization) + _as_made(_analysis(*definition).model, observed))
+    model, drawn = _analysis(*definition).model, _drawn_sky(definition, seed, realization)
+    if spread is not None:
+        lmax = model.survey.config.sky.lmax
+        drawn = alm_.multiply(drawn, np.append(spread, np.ones(lmax - model.lmax)), lmax)
+    return np.asarray(drawn + _as_made(model, observed))
 
 
 @lru_cache(maxsize=48)  # as many as are drawn for the scatter of a stochastic effect, again and again

@@ -26,7 +26,7 @@ from mcsim.errors import InputError
 from mcsim.simulation.nuisance import draws
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.shrinkage import shrunk
-from mcsim.support.arrays import Vector
+from mcsim.support.arrays import Alm, Cl, Vector
 from mcsim.support.progress import reporting
 from mcsim.systematics import Effect
 
@@ -407,10 +407,11 @@ def after_jobs(analysis: Analysis, found: Sequence[config.Effect], skies: int | 
 
 
 def constrained_jobs(
-    analysis: Analysis, found: Sequence[config.Effect], observed: NDArray[np.complex128], realizations: range
+    analysis: Analysis, found: Sequence[config.Effect], observed: Alm, realizations: range, spread: Cl | None = None
 ) -> list[Job]:
-    """List jobs that simulate the model with effects, over skies that are constrained by an observed one."""
-    return in_tasks(replace(_with(analysis, found), observed=observed), realizations, _CONSTRAINED_PER_TASK)
+    """List jobs that simulate the model with effects, over skies that an observed one constrains, with this spread."""
+    own = replace(_with(analysis, found), observed=observed, spread=spread)
+    return in_tasks(own, realizations, _CONSTRAINED_PER_TASK)
 
 
 def _with(analysis: Analysis, found: Sequence[config.Effect]) -> Job:

@@ -104,6 +104,11 @@ class Model:
         return tuple(zip(responses, colours, members, strict=True))
 
     @cached_property
+    def unknown(self) -> Cl:
+        """Return the power of the sky that all maps leave unknown in the isotropic approximation, uK^2, (lmax + 1,)."""
+        return np.asarray(self.cl / (1.0 + self.cl * self._weight(self.colours)))
+
+    @cached_property
     def hides(self) -> bool:
         """Return True if a map lacks a part of the sky that is more than little."""
         return hidden_share(self.parts) >= self.settings.hidden_share

@@ -13,14 +13,14 @@ from mcsim import config, systematics
 from mcsim.datavector.added_maps import Added, AddedMaps
 from mcsim.datavector.analysis import Analysis, Job
 from mcsim.datavector.campaign import Ask, after_jobs, constrained_jobs
-from mcsim.datavector.filter_model import seen_through
+from mcsim.datavector.filter_model import Model, seen_through
 from mcsim.datavector.shared_sky import shared_sky
 from mcsim.instrument.beams import Beam
 from mcsim.simulation import convolve
 from mcsim.simulation.channels import table_of
 from mcsim.simulation.survey import Channel
 from mcsim.sphere.alm import degrees, orders
-from mcsim.support.arrays import Alm, Map, Matrix, Vector, divided
+from mcsim.support.arrays import Alm, Cl, Map, Matrix, Vector, divided
 from mcsim.systematics.added import DipoleResidual
 
 SMALL = 2e-3  #: gain of a channel that observed skies may have in them: responses are wrong by less than this share
@@ -103,13 +103,21 @@ class SameSkies:
         model = self.analysis.model
         if not factors:
             return shared_sky(model, maps)
-        rows = np.array(factors)
-        gains = np.where(np.ptp(rows, axis=1) == 0.0, rows[:, 0], 1.0)
+        gains, _ = _split(factors)
         pairs = zip(maps, gains[[part.channel for part in model.parts]], strict=True)
         given = [map_ if g == 1.0 else np.where(map_ == healpy.UNSEEN, map_, map_ / g) for map_, g in pairs]
-        if np.any((shapes := rows / gains[:, None]) != 1.0):
-            model = seen_through(model, model.response * shapes)
-        return shared_sky(model, given)
+        return shared_sky(self._model(factors), given)
+
+    def _model(self, factors: Factors) -> Model:
+        """Return the model of maps whose degrees channels see otherwise, but for their :func:`_split` gains."""
+        model, (_, shapes) = self.analysis.model, _split(factors)
+        return seen_through(model, model.response * shapes) if np.any(shapes != 1.0) else model
+
+    def spread(self, factors: Factors) -> Cl | None:
+        """Return by how much skies scatter about the observed one, over that without effects, (lmax + 1,); None: 1."""
+        if not factors:
+            return None
+        return np.sqrt(divided(self._model(factors).unknown, self.analysis.model.unknown, 1.0))
 
     def _without(self, orders: Orders, sky: Alm, maps: Sequence[Map]) -> list[Map]:
         """Return maps without what other orders of the beams show of a sky."""
@@ -242,7 +250,8 @@ class SameSkies:
         if not constrained or skies is None:
             jobs = after_jobs(self.analysis, found, skies)
         else:
-            jobs = constrained_jobs(self.analysis, found, self.observed_with(there), range(first, skies))
+            observed, spread = self.observed_with(there), self.spread(self.factors(there))
+            jobs = constrained_jobs(self.analysis, found, observed, range(first, skies), spread)
         source = self.analysis.source_of(found, given_sky=constrained)
         return [replace(job, slices=True, source=source) for job in jobs]
 
@@ -251,6 +260,16 @@ class SameSkies:
         missing = [job for job in jobs if known[_key(job)] is None]
         known.update(zip(map(_key, missing), self.ask(missing) if missing else [], strict=True))
         return np.concatenate([rows for rows in known.values() if rows is not None])
+
+
+def _split(factors: Factors) -> tuple[Vector, Matrix]:
+    """Return gains by which maps are divided, shape (channel,), and what else changes each degree, (channel, lmax + 1).
+
+    A gain beyond BENT makes noise far from what the filter takes it to be, if maps are divided by it.
+    """
+    rows = np.array(factors)
+    gains = np.where((np.ptp(rows, axis=1) == 0.0) & (np.abs(rows[:, 0] - 1.0) <= BENT), rows[:, 0], 1.0)
+    return gains, rows / gains[:, None]
 
 
 def makes_means(effect: systematics.Effect, site: systematics.Site) -> bool:

@@ -1,4 +1,4 @@
-"""Skies that the data constrain have the power of the model's, whatever a preparation has done to the maps."""
+"""Skies that the data constrain have the power of the model's, whatever a preparation or an effect did to the maps."""
 
 from dataclasses import replace
 
@@ -11,7 +11,8 @@ from mcsim import config
 from mcsim.bipolar import power_spectrum
 from mcsim.config.noise import Noise
 from mcsim.datavector.analysis import analysis_of, simulated_maps
-from mcsim.datavector.campaign import constrained_jobs
+from mcsim.datavector.campaign import constrained_jobs, with_effects
+from mcsim.datavector.same_skies import SameSkies
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.shared_sky import shared_sky
 from mcsim.simulation import simulate
@@ -65,12 +66,35 @@ def test_constrained_skies_have_the_power_of_the_model(steps, fine, hidden, tmp_
     bare = replace(run.map, mask=None, mask_frame=None)
     quiet = tuple(replace(one, noise=SILENT) for one in run.channels)
     plain = replace(run, channels=quiet, map=bare, preparation=())
-    expected = np.array([power(list(simulate.maps(survey(plain), k))) for k in range(SIMULATIONS)])
-    found = []
+    jobs = []
     for realization in range(SIMULATIONS, SIMULATIONS + DATA):
         observed = shared_sky(model, list(simulate.maps(model.survey, realization)))
-        (job,) = constrained_jobs(analysis, (), observed, range(1))
-        found += [power(one) for one in simulated_maps(replace(job, simulated=config.to_json(plain)))]
+        jobs += constrained_jobs(analysis, (), observed, range(1))
+    assert_power_of(plain, jobs)
+
+
+def assert_power_of(plain, jobs):
+    """Assert that the skies of jobs, in maps without noise and preparation, have the power of the model's."""
+    expected = np.array([power(list(simulate.maps(survey(plain), k))) for k in range(SIMULATIONS)])
+    simulated = [replace(job, simulated=config.to_json(plain)) for job in jobs]
+    found = [power(one) for job in simulated for one in simulated_maps(job)]
     mean = expected.mean(axis=0)
-    error = expected.std(axis=0, ddof=1) * np.sqrt(1.0 / DATA + 1.0 / SIMULATIONS)
+    error = expected.std(axis=0, ddof=1) * np.sqrt(1.0 / len(found) + 1.0 / SIMULATIONS)
     assert np.all(np.abs(np.mean(found, axis=0) - mean) < 5.0 * error + NEARLY * mean)
+
+
+@pytest.mark.parametrize("amplitude", [0.6, -0.6], ids=["wider", "narrower"])
+def test_skies_scatter_by_as_much_as_a_beam_hides(amplitude):
+    """Of degrees that a wider beam hides, less is known than the filter of the model knows, which adds the scatter."""
+    table = two_channels("hidden", lmax=5 * NSIDE // 2, nside=NSIDE, fwhm_arcmin=600.0, sigma0_uk=40.0)
+    table["biposh"]["lmax"] = 2 * NSIDE
+    run = config.load(table)
+    analysis = analysis_of(run, settings=DiagnosisSettings())
+    names = [channel.name for channel in run.channels]
+    found = [config.Effect(name="beam_width", channel=one, parameters={"amplitude": amplitude}) for one in names]
+    observed = survey(with_effects(run, found))
+    jobs = []
+    for realization in range(SIMULATIONS, SIMULATIONS + DATA):
+        skies = SameSkies(analysis, lambda _: [], list(simulate.maps(observed, realization)))
+        jobs += skies._jobs((), True, 1, there=found)
+    assert_power_of(replace(run, channels=tuple(replace(one, noise=SILENT) for one in run.channels)), jobs)
