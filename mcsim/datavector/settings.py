@@ -124,7 +124,8 @@ class DiagnosisSettings:
     sky_scatter
         Relative scatter of a response above which it is simulated for the observed sky.
     stochastic_level
-        Global p-value up to which a stochastic effect is simulated at its amplitude, if no single effect is accepted.
+        Global p-value up to which a stochastic effect is simulated at its amplitude, if no single effect is accepted;
+        all are if no set of effects is.
     settled_sigma, settled_share
         Amplitudes have converged if they move by less than so many standard errors, or by this share.
     tried

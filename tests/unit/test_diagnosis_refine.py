@@ -342,6 +342,27 @@ def test_a_stochastic_effect_that_may_suffice_is_simulated_beside_a_single_one(m
     assert {one.members for one in found.explanations} == members
 
 
+def test_a_stochastic_effect_is_tried_where_nothing_explains_the_data(monkeypatch):
+    """What A has drawn is 20 times its mean, which beside that is not significant, and C is like what was drawn."""
+    instrument = Instrument(bend=0.0, cross=0.0)
+    instrument.settings = replace(instrument.settings, tried=1)
+    kind = type("Draws", (Push,), {"parametrization": Parametrization(stochastic=True)})
+    instrument.candidates[0] = Candidate(kind, "A", (0,))
+    mean, (across, beside) = instrument.t[:, 0], instrument.sideways
+    instrument.t[:, 2] = 0.95 * across + np.sqrt(1.0 - 0.95**2) * beside
+    drawn = mean + 20.0 * np.random.default_rng(25).normal(size=(48, 1)) * across
+
+    def respond(tables, skies):
+        (table,) = tables
+        response = np.tile(instrument.t[:, 2], (skies, 1)) if table.channel == "C" else drawn[:skies]
+        return float(table.parameters["amplitude"]) * response
+
+    monkeypatch.setattr(instrument, "respond", respond)
+    (found,) = instrument.refined(12.0 * (mean + 20.0 * across)).attribution.explanations
+    assert found.members == (0,)
+    assert found.fit.amplitudes == pytest.approx([12.0], abs=4.0 * found.fit.errors[0])
+
+
 @pytest.mark.parametrize("enough", [3.0, 30.0], ids=["suffices alone", "does not"])
 def test_a_stochastic_effect_is_tried_at_the_amplitude_that_it_has_alone(monkeypatch, enough):
     """Beside others its amplitude is 2, alone it is 14: that alone with the scatter of the latter suffices is found."""
