@@ -154,8 +154,8 @@ class Model:
             return None
         parts, templates = [], templates_of(self.survey.preparations)
         for part, mask, own in zip(self.parts, self.masks, templates, strict=True):
-            subtracted = () if own is None else ((divided(own, mask), part.precision),)
             precision = part.precision * mask**2 / self.white[part.channel]
+            subtracted = () if own is None else ((divided(own, mask), precision),)
             parts.append(replace(part, precision=precision, subtracted=subtracted))
         noise, white = (divided(1.0, self._weight(rows)) for rows in (self.colours, self.white[:, None]))
         total = self.cl + np.where(noise > (1.0 + LITTLE) * white, noise - white, 0.0)

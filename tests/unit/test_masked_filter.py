@@ -9,6 +9,7 @@ import pytest
 from instruments import two_channels
 from mcsim import config
 from mcsim.config.noise import NoiseCorrelated
+from mcsim.config.preparation import Mask, Templates
 from mcsim.datavector.analysis import analysis_of, data_vectors
 from mcsim.datavector.bipolar_scan import BipolarScan
 from mcsim.datavector.filter_model import model_of
@@ -269,6 +270,24 @@ def test_what_is_subtracted_may_depend_on_pixels_that_a_mask_hides(bright):
     assert np.any(filtered.residual[0][hidden] != 0.0)
     assert np.all(filtered.difference[:, hidden] == 0.0)
     assert np.all(filtered.squares[:, hidden] == 0.0)
+
+
+def test_what_is_fitted_behind_a_soft_mask_leaves_the_noise_of_pixels(run, tmp_path, monkeypatch):
+    """Where the mask is nearly zero, what is left of a template was up to 130 times the noise."""
+    monkeypatch.chdir(tmp_path)
+    soft = (np.abs(HEIGHT) > CUT).astype(float)
+    soft[100:105] = 10.0 ** -np.arange(2.0, 7.0)
+    healpy.write_map("soft.fits", soft, dtype=np.float64)
+    healpy.write_map("template.fits", 1.0 + HEIGHT**2, dtype=np.float64)
+    steps = (
+        Mask(mask="soft.fits", mask_frame="ecliptic"),
+        Templates(templates=("template.fits",)),
+    )
+    prepared = replace(run, map=replace(run.map, mask=None, mask_frame=None), preparation=steps)
+    model = modelled(prepared)
+    filtered = wiener_filter(model, list(simulate.maps(model.survey, 5)))
+    assert np.abs(filtered.difference).max() < 30.0  # of some 4,000 squares of unit normals, less one
+    assert np.mean(filtered.difference[filtered.difference != 0.0]) == pytest.approx(0.0, abs=0.1)
 
 
 def test_noise_with_memory_has_no_exact_scores_in_bright_maps(bright):
