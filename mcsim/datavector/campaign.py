@@ -144,8 +144,8 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
         for job in in_tasks(analysis.job(quiet), range(_scaled(analysis, settings.time_ordered_skies)), 1):
             jobs[Purpose("time-ordered", job.first)] = replace(job, sample_by_sample=True)
             jobs[Purpose("default", job.first)] = job
-    for job in in_tasks(analysis.job(seeded(run, _COVARIANCE)), range(wanted)):
-        drawn = replace(job, nuisances=bool(run.nuisances), bipolar_scan=job.first < settings.scan_sims)
+    for job in null_jobs(analysis, wanted):
+        drawn = replace(job, bipolar_scan=job.first < settings.scan_sims)
         jobs[Purpose("null", job.first)] = replace(drawn, source=analysis.source)
     own = analysis.source_of(())
     for job in in_tasks(analysis.job(base), range(settings.noisy_skies)):
@@ -158,6 +158,12 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
         if count := skies(analysis, candidate, sign):
             jobs[Purpose("response", column, sign)] = replace(acting, count=count)
     return {purpose: replace(job, slices=analysis.of_maps) for purpose, job in jobs.items()}
+
+
+def null_jobs(analysis: Analysis, count: int, found: Sequence[config.Effect] = ()) -> list[Job]:
+    """List jobs of as many simulations of the model for the covariance by mcsim, with effects on request."""
+    job = analysis.job(with_effects(seeded(analysis.run, _COVARIANCE), found))
+    return in_tasks(replace(job, nuisances=bool(analysis.run.nuisances), slices=analysis.of_maps), range(count))
 
 
 def check_count(analysis: Analysis, simulations: int | None) -> None:
@@ -416,6 +422,12 @@ def constrained_jobs(
 
 def _with(analysis: Analysis, found: Sequence[config.Effect]) -> Job:
     return analysis.job(with_effects(seeded(analysis.run, _RESPONSE), found))
+
+
+def without_repeats(noise: Sequence[config.Effect], found: Sequence[config.Effect]) -> Sequence[config.Effect]:
+    """Return noise effects that act in all simulations; () if effects that are simulated say what they are."""
+    own = {(one.name, one.channel) for one in found}
+    return () if any((one.name, one.channel) in own for one in noise) else noise
 
 
 def with_effects(run: config.RunConfig, found: Sequence[config.Effect]) -> config.RunConfig:

@@ -293,14 +293,21 @@ def _precision(parts: Sequence[Part], alike: float) -> Map:
     return np.asarray(total / (1.0 + alike * total))
 
 
-def seen_through(model: Model, response: Matrix) -> Model:
-    """Return the model if its channels see the sky through another response, shape (channel, lmax + 1)."""
-    inverse = model.inverse
+def seen_through(model: Model, response: Matrix, noise: Vector) -> Model:
+    """Return the model if its channels see the sky through another response, shape (channel, lmax + 1).
+
+    ``noise`` are the factors of the variance of their noise, shape (channel,).
+    """
+    inverse, parts = model.inverse, tuple(_noisier(part, float(noise[part.channel])) for part in model.parts)
     if model.pooled:
-        inverse = _of_mean(model.cl, _mean(response, model.parts), _precision(model.parts, model.pooled))
+        inverse = _of_mean(model.cl, _mean(response, parts), _precision(parts, model.pooled))
     elif inverse is not None:
-        inverse = inverse_of(model.cl, response, model.parts)
-    return replace(model, response=response, inverse=inverse, least=model.white)
+        inverse = inverse_of(model.cl, response, parts)
+    return replace(model, response=response, parts=parts, inverse=inverse, least=model.white)
+
+
+def _noisier(part: Part, factor: float) -> Part:
+    return replace(part, precision=part.precision / factor, noise_power=part.noise_power * factor)
 
 
 def inverse_of(cl: Cl, response: Matrix, parts: Sequence[Part], offsets: bool = False) -> InverseCovariance:

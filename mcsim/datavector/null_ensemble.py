@@ -150,6 +150,18 @@ class NullEnsemble:
         simulations, reference = self.simulations @ matrix.T, self.reference @ matrix.T
         return replace(self, simulations=simulations, offset=matrix @ self.offset, reference=reference)
 
+    def scattered_as(self, simulations: Matrix, reference: Matrix) -> "NullEnsemble":
+        """Return the ensemble with the scatter of other simulations, (N, p + E), about its mean, and a reference."""
+        size, beside = len(self.elements), len(self.slice_elements)
+        deviations, own = np.split(simulations - simulations.mean(axis=0), [size], axis=1)
+        return replace(
+            self,
+            simulations=self.simulations.mean(axis=0) + deviations,
+            reference=reference[:, :size],
+            slices=self.slices.mean(axis=0) + own if beside else self.slices,
+            slice_reference=reference[:, size:],
+        )
+
     def of_mean(self, realizations: int) -> "NullEnsemble":
         """Return the ensemble of the mean of several skies.
 

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from typing import Literal
 
 import healpy
@@ -12,7 +12,7 @@ import numpy as np
 from mcsim import config, systematics
 from mcsim.datavector.added_maps import Added, AddedMaps
 from mcsim.datavector.analysis import Analysis, Job
-from mcsim.datavector.campaign import Ask, after_jobs, constrained_jobs
+from mcsim.datavector.campaign import Ask, after_jobs, constrained_jobs, without_repeats
 from mcsim.datavector.filter_model import Model, seen_through
 from mcsim.datavector.shared_sky import shared_sky
 from mcsim.instrument.beams import Beam
@@ -27,6 +27,8 @@ SMALL = 2e-3  #: gain of a channel that observed skies may have in them: respons
 
 BENT = 0.1  #: change of a beam at some degree, beside a gain, that observed skies may have in them
 
+NOISY = 0.2  #: change of the variance of noise that the filter of observed skies need not know
+
 ROUNDS, STILL = 8, 1e-3  #: of finding a sky that is seen through other orders of beams, and relative change at the end
 
 Factors = tuple[tuple[float, ...], ...]  #: by which channels see degrees otherwise, (channel, lmax + 1); (): not
@@ -34,7 +36,9 @@ Factors = tuple[tuple[float, ...], ...]  #: by which channels see degrees otherw
 Orders = tuple[bytes, ...]
 """What beams have more in orders m > 0, by channel: complex b_lm, (m, lmax + 1), the first row zero; b"": little."""
 
-Seen = tuple[Factors, Orders, Added]  #: how channels see a sky otherwise, and what maps show besides
+Noise = tuple[float, ...]  #: factors of the variance of the noise of channels; (): about one
+
+Seen = tuple[Factors, Noise, Orders, Added]  #: how channels see a sky otherwise, and what maps show besides
 
 Skies = Literal["reference", "typical", "constrained"]
 
@@ -49,9 +53,12 @@ class SameSkies:
     analysis: Analysis
     ask: Ask
     maps: Sequence[Map]
-    # Data vectors without any effect, as many as were needed so far. Keys are True for constrained skies, for an
-    # external simulator, and how the maps were seen that constrain them.
-    _before: dict[tuple[bool, bool, Seen], list[Vector]] = field(default_factory=lambda: defaultdict(list), init=False)
+    noise: Sequence[config.Effect] = ()  # that all simulations have, but for those with such effects of their own
+    # Data vectors without any effect but noise, as many as were needed so far. Keys are True for constrained skies, for
+    # an external simulator, and with noise, and how the maps were seen that constrain them.
+    _before: dict[tuple[bool, bool, bool, Seen], list[Vector]] = field(
+        default_factory=lambda: defaultdict(list), init=False
+    )
     # What was simulated ahead, by all that tells such jobs apart.
     _ahead: dict[tuple[str, int, int, bytes], Matrix] = field(default_factory=dict, init=False)
 
@@ -69,9 +76,9 @@ class SameSkies:
         one, and a fit gives g/(1 + w g). So it is with each degree that a beam loses. Gains up to SMALL and beams up to
         BENT, the steps of linear responses among them, stay. What orders m > 0 of a beam add to a map is another map of
         the sky, which is in the filtered one with a weight, too: it is computed from the sky that is found, and taken
-        from the maps, until that sky changes no more. What effects show without a sky, a foreground or a residual
-        dipole behind a mask, is simulated and taken from the maps first. Where a sky has a part of it already, the
-        effect adds more than it did to the data, and the fit too little.
+        from the maps, until that sky changes no more. Other noise changes the weights. What effects show without a sky,
+        a foreground or a residual dipole behind a mask, is simulated and taken from the maps first. Where a sky has a
+        part of it already, the effect adds more than it did to the data, and the fit too little.
         """
         return self._skies(self.seen(found))
 
@@ -85,12 +92,12 @@ class SameSkies:
 
     def _sky(self, seen: Seen) -> Alm:
         """Return the filtered sky of the maps if channels see it otherwise."""
-        factors, orders, added = seen
+        factors, noise, orders, added = seen
         maps = self._added.less(self.maps, added)
-        found = before = self._through(factors, maps)
+        found = before = self._through(factors, noise, maps)
         changed = np.inf
         for _ in range(ROUNDS if orders else 0):
-            last, before, found = changed, found, self._through(factors, self._without(orders, found, maps))
+            last, before, found = changed, found, self._through(factors, noise, self._without(orders, found, maps))
             changed = float(np.linalg.norm(found - before) / np.linalg.norm(before))
             if changed >= last:
                 return before
@@ -98,26 +105,38 @@ class SameSkies:
                 break
         return found
 
-    def _through(self, factors: Factors, maps: Sequence[Map]) -> Alm:
-        """Return the filtered sky of maps whose degrees channels see otherwise."""
-        model = self.analysis.model
-        if not factors:
-            return shared_sky(model, maps)
-        gains, _ = _split(factors)
+    def _through(self, factors: Factors, noise: Noise, maps: Sequence[Map]) -> Alm:
+        """Return the filtered sky of maps whose degrees channels see otherwise, with other noise."""
+        model, (gains, _) = self._model(factors, noise), self._split(factors)
         pairs = zip(maps, gains[[part.channel for part in model.parts]], strict=True)
         given = [map_ if g == 1.0 else np.where(map_ == healpy.UNSEEN, map_, map_ / g) for map_, g in pairs]
-        return shared_sky(self._model(factors), given)
+        return shared_sky(model, given)
 
-    def _model(self, factors: Factors) -> Model:
-        """Return the model of maps whose degrees channels see otherwise, but for their :func:`_split` gains."""
-        model, (_, shapes) = self.analysis.model, _split(factors)
-        return seen_through(model, model.response * shapes) if np.any(shapes != 1.0) else model
+    @cached_property
+    def _model(self) -> Callable[[Factors, Noise], Model]:
+        return lru_cache(maxsize=1)(self._model_of)
 
-    def spread(self, factors: Factors) -> Cl | None:
+    def _model_of(self, factors: Factors, noise: Noise) -> Model:
+        """Return the model of maps whose degrees channels see otherwise, but for their gains, with other noise."""
+        model, (_, shapes) = self.analysis.model, self._split(factors)
+        if not noise and np.all(shapes == 1.0):
+            return model
+        return seen_through(model, model.response * shapes, np.array(noise or np.ones(len(shapes))))
+
+    def _split(self, factors: Factors) -> tuple[Vector, Matrix]:
+        """Return gains by which maps are divided, (channel,), and what else changes each degree, (channel, lmax + 1).
+
+        A gain beyond BENT makes noise far from what the filter takes it to be, if maps are divided by it.
+        """
+        rows = np.array(factors) if factors else np.ones_like(self.analysis.model.response)
+        gains = np.where((np.ptp(rows, axis=1) == 0.0) & (np.abs(rows[:, 0] - 1.0) <= BENT), rows[:, 0], 1.0)
+        return gains, rows / gains[:, None]
+
+    def spread(self, factors: Factors, noise: Noise = ()) -> Cl | None:
         """Return by how much skies scatter about the observed one, over that without effects, (lmax + 1,); None: 1."""
-        if not factors:
+        if not (factors or noise):
             return None
-        return np.sqrt(divided(self._model(factors).unknown, self.analysis.model.unknown, 1.0))
+        return np.sqrt(divided(self._model(factors, noise).unknown, self.analysis.model.unknown, 1.0))
 
     def _without(self, orders: Orders, sky: Alm, maps: Sequence[Map]) -> list[Map]:
         """Return maps without what other orders of the beams show of a sky."""
@@ -134,7 +153,15 @@ class SameSkies:
 
     def seen(self, found: Sequence[config.Effect]) -> Seen:
         """Return how the channels see a sky otherwise with effects."""
-        return self.factors(found), self.orders(found), self._added.run_of(found)
+        return self.factors(found), self.noise_of(found), self.orders(found), self._added.run_of(found)
+
+    def noise_of(self, found: Sequence[config.Effect]) -> Noise:
+        """Return by how much effects change the variance of the noise of each channel; () if all is little."""
+        row = []
+        for channel in self.analysis.model.survey.channels if found else ():
+            each = [effect.noise(channel.site) for effect in self._acting(channel, found)]
+            row.append(float(np.prod([np.mean(one) for one in each if one is not None])))
+        return tuple(row) if any(abs(one - 1.0) > NOISY for one in row) else ()
 
     def orders(self, found: Sequence[config.Effect]) -> Orders:
         """Return what effects add to the orders m > 0 of the beams; () if all is little."""
@@ -219,22 +246,24 @@ class SameSkies:
 
         One by one they would leave workers waiting. InputError if one of them cannot be simulated.
         """
-        kinds = [(effect, self.skies_of(effect)) for effect in each]
-        sets = [([effect], kind == "constrained", None if kind == "reference" else skies) for effect, kind in kinds]
+        kinds = [([*without_repeats(self.noise, [effect]), effect], self.skies_of(effect)) for effect in each]
+        sets = [(found, kind == "constrained", None if kind == "reference" else skies) for found, kind in kinds]
         jobs = [job for one in sets for job in self._jobs(*one, there=one[0])]
         self._ahead.update(zip(map(_key, jobs), self.ask(jobs) if jobs else [], strict=True))
 
     def of_reference(self, found: Sequence[config.Effect]) -> Matrix:
         """Return data vectors with effects, of the skies with which responses are measured."""
-        return self._simulated(self._jobs(found, False, None))
+        return self._simulated(self._jobs([*without_repeats(self.noise, found), *found], False, None))
 
     def pair(self, found: Sequence[config.Effect], skies: int, constrained: bool) -> tuple[Matrix, Matrix]:
         """Return data vectors of the same skies without effects and with them, which the observed maps have too."""
-        jobs = self._jobs(found, constrained, skies, there=found)
-        source = jobs[0].source
-        before = self._before[constrained, source is not None, self.seen(found) if constrained else ((), (), "")]
+        noise = without_repeats(self.noise, found)
+        there = [*noise, *found]
+        jobs = self._jobs(there, constrained, skies, there=there)
+        source, seen = jobs[0].source, self.seen(there) if constrained else ((), (), (), "")
+        before = self._before[constrained, source is not None, bool(noise), seen]
         if (first := len(before)) < skies:
-            same = [replace(job, source=source) for job in self._jobs((), constrained, skies, first, found)]
+            same = [replace(job, source=source) for job in self._jobs(noise, constrained, skies, first, there)]
             before.extend(self._simulated(same)[first - skies :])
         return np.stack(before[:skies]), self._simulated(jobs)
 
@@ -250,7 +279,7 @@ class SameSkies:
         if not constrained or skies is None:
             jobs = after_jobs(self.analysis, found, skies)
         else:
-            observed, spread = self.observed_with(there), self.spread(self.factors(there))
+            observed, spread = self.observed_with(there), self.spread(self.factors(there), self.noise_of(there))
             jobs = constrained_jobs(self.analysis, found, observed, range(first, skies), spread)
         source = self.analysis.source_of(found, given_sky=constrained)
         return [replace(job, slices=True, source=source) for job in jobs]
@@ -260,16 +289,6 @@ class SameSkies:
         missing = [job for job in jobs if known[_key(job)] is None]
         known.update(zip(map(_key, missing), self.ask(missing) if missing else [], strict=True))
         return np.concatenate([rows for rows in known.values() if rows is not None])
-
-
-def _split(factors: Factors) -> tuple[Vector, Matrix]:
-    """Return gains by which maps are divided, shape (channel,), and what else changes each degree, (channel, lmax + 1).
-
-    A gain beyond BENT makes noise far from what the filter takes it to be, if maps are divided by it.
-    """
-    rows = np.array(factors)
-    gains = np.where((np.ptp(rows, axis=1) == 0.0) & (np.abs(rows[:, 0] - 1.0) <= BENT), rows[:, 0], 1.0)
-    return gains, rows / gains[:, None]
 
 
 def makes_means(effect: systematics.Effect, site: systematics.Site) -> bool:

@@ -28,7 +28,7 @@ def result_of(
 ) -> DiagnosisResult:
     """Return the result of a case from its final attribution and the reduction on held-out data."""
     context, found, partial = data.context, refined.attribution, refined.partial
-    ensemble, null, model = context.ensemble, context.null, context.analysis.model
+    ensemble, null, model, tested = context.ensemble, context.null, context.analysis.model, context.of_model
     residuals = data.residual_maps()
     return DiagnosisResult(
         case=case,
@@ -49,16 +49,16 @@ def result_of(
         held_out=reduction,
         nuisances=tuple(_nuisances(data, refined)),
         places=tuple(data.places()),
-        candidates=tuple(_candidates(context, refined)),
+        candidates=tuple(_candidates(data, refined)),
         elements=context.analysis.elements,
         maps=tuple(part.name for part in model.parts),
         data=data.x,
         mean=null.mean,
-        standard_deviation=ensemble.simulations.std(axis=0, ddof=1),
+        standard_deviation=tested.ensemble.simulations.std(axis=0, ddof=1),
         templates=refined.templates,
         correlation=found.correlation,
-        held_out_pvalues=ensemble.held_out_pvalues(null),
-        calibration=context.calibration.combined,
+        held_out_pvalues=tested.ensemble.held_out_pvalues(tested.null),
+        calibration=tested.calibration.combined,
         residual_maps=residuals,
         residual_range=None if residuals is None else np.quantile(ensemble.residual_rms, [0.025, 0.975], axis=0).T,
         frame=model.frame,
@@ -189,12 +189,12 @@ def _longer(candidate: Candidate, theta: Vector, covariance: Matrix) -> float:
     return max(more, 0.0)
 
 
-def _candidates(context: DiagnosisContext, refined: Refined) -> Iterator[CandidateResult]:
+def _candidates(data: DataSet, refined: Refined) -> Iterator[CandidateResult]:
     """Yield every candidate with its fit alone, what would be detected, and what is most like it."""
-    null, t, found, candidates = context.null, refined.templates, refined.attribution, context.candidates
+    null, t, found, candidates = data.context.null, refined.templates, refined.attribution, data.context.candidates
     responds = np.any(t != 0.0, axis=0)
     rank = np.array([int(responds[list(one.columns)].sum()) for one in candidates])
-    pvalues = null.nested_test(np.array([s.delta_chi2 for s in found.singles]), found.gap.chi2, rank)
+    pvalues = null.nested_test(np.array([s.delta_chi2 for s in found.singles]), null.chi2(data.x), rank)
     for k, candidate in enumerate(candidates):
         columns = list(candidate.columns)
         try:

@@ -11,7 +11,7 @@ import numpy as np
 
 from mcsim import config
 from mcsim.datavector.analysis import Analysis
-from mcsim.datavector.campaign import Ask, after_jobs, skies
+from mcsim.datavector.campaign import Ask, after_jobs, skies, without_repeats
 from mcsim.datavector.candidate import Candidate, TemplateBank
 from mcsim.datavector.localisation import Place
 from mcsim.datavector.nuisances import with_nuisances
@@ -39,6 +39,8 @@ class DiagnosisContext:
     sky_scatter: Vector  # relative scatter of each candidate's response among skies, (candidates,)
     templates: Matrix  # (p, K), of noisy ones faint elements are shrunk
     always: WhitenedTemplates  # those of candidates that are proposed whatever the data are, white, one by one
+    noise: tuple[config.Effect, ...] = ()  # with which ensemble and null distribution scatter, about the model's mean
+    without_noise: "DiagnosisContext | None" = None  # what the model itself is tested with, if that is another
 
     @property
     def run(self) -> config.RunConfig:
@@ -49,6 +51,15 @@ class DiagnosisContext:
     def settings(self) -> DiagnosisSettings:
         """Return the settings of the analysis."""
         return self.analysis.settings
+
+    @property
+    def of_model(self) -> "DiagnosisContext":
+        """Return what the model itself is tested with, whatever noise was found."""
+        return self.without_noise or self
+
+    def knows(self, one: config.Effect) -> bool:
+        """Return True for an effect whose noise is in the scatter of the null distribution."""
+        return not without_repeats(self.noise, [one]) and bool(self.noise)
 
     @property
     def of_pixel_means(self) -> "DiagnosisContext":
@@ -62,6 +73,8 @@ class DiagnosisContext:
 
     def extended_reference(self, found: Sequence[config.Effect]) -> Matrix:
         """Return those of :meth:`reference` with the numbers beside the data vector behind it, (skies, p + E)."""
+        if self.noise and not without_repeats(self.noise, found):
+            return self.of_model.extended_reference(found)
         if self.analysis.source_of(found) is None:
             return self.ensemble.extended.reference
         assert self.ensemble.external_reference is not None  # simulated where the source can add effects
@@ -101,7 +114,7 @@ class DataSet(ABC, Generic[Data]):
     @cached_property
     def gap(self) -> GlobalTest:
         """Return the test of the data against the model, with templates that were known before the data."""
-        known = self.context
+        known = self.context.of_model
         return global_test(known.null, self.x, known.always, known.calibration)
 
     @property

@@ -17,6 +17,7 @@ from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.bent import bent_templates
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import as_seen
+from mcsim.diagnosis.found_noise import in_words, with_found_noise
 from mcsim.diagnosis.naming import agreeing, unconfirmed
 from mcsim.diagnosis.partial import PartialSearch
 from mcsim.diagnosis.refine import Refined, Refiner
@@ -37,9 +38,10 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     context, t = data.context, data.templates()
     start = bent_templates(context.null, data.x, t, context.bank.curvature, context.candidates)
     refined = Refiner(data).run(t, context.candidates, start=start)
+    data, refined = with_found_noise(data, refined)
     found, reduction = refined.attribution.if_named(data.context.settings), None
     exchanged = data.exchanged(found)
-    notes, refusals = [*exchanged, *data.notes()], list[str]()
+    notes, refusals = [*exchanged, *in_words(data.context), *data.notes()], list[str]()
     if not exchanged and found.explanations:
         found, refusals = agreeing(data, refined, found)
         if (beside := with_rivals(data, refined, found)) is not None:
@@ -110,14 +112,19 @@ def _scattered(data: DataSet[Any], members: Sequence[int], t: Matrix, scatters: 
     if scatters:
         return with_drawn_scatter(context.null, t, fit, scatters)
     with suppress(InputError):  # between what was fitted and what can be
-        groups = data.in_same_skies(tables_at(context.candidates, members, first))
-        pairs = [pair for own in groups if (pair := data.pair(own)) is not None]
-        for pair in pairs:
+        acting = tables_at(context.candidates, members, first)
+        groups, unknown = data.in_same_skies(acting), [one for one in acting if not context.knows(one)]
+        pairs = _pairs(data, groups)
+        for pair in pairs if unknown == acting else _pairs(data, data.in_same_skies(unknown)):
             fit = with_scatter(context.null, t, fit, *pair)
         bend = context.null.whiten_templates(t - context.templates[:, columns_of(context.candidates, members)])
         tables = tables_beside(context.candidates, members, first, bend, context.settings.nonlinear_sigma)
         fit = with_tangents(context.null, t, fit, [_slope(data, groups, pairs, *one) for one in tables])
     return fit
+
+
+def _pairs(data: DataSet[Any], groups: Sequence[Sequence[config.Effect]]) -> list[tuple[Matrix, Matrix]]:
+    return [pair for own in groups if (pair := data.pair(own)) is not None]
 
 
 def _slope(
@@ -179,8 +186,10 @@ def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:
         return change
 
     def skies(frozen: Fit) -> tuple[Matrix, Matrix] | None:
+        acting = acting_at(frozen)
         noisier = any(context.candidates[member].parametrization.noise_alone for member in members)
-        pair = data.pair(acting_at(frozen)) if noisier and not scatters else None
+        noisier = noisier and not any(map(context.knows, acting))
+        pair = data.pair(acting) if noisier and not scatters else None
         return None if pair is None else (pair[0] @ matrix.T, pair[1] @ matrix.T)
 
     try:

@@ -110,12 +110,13 @@ def _actions(data: DataSet[Any], refined: Refined, one: Explanation) -> Iterator
             pair = data.pair_extended([candidate.table(effect)], skies)
             changes = pair[1] - pair[0]
             own = (effect.noise(one.site) for one in sites if candidate.channel in (None, one.site.channel))
-            growth = max([1.0, *(float(np.mean(one)) for one in own if one is not None)])
+            if not (known := context.knows(candidate.table(effect))):
+                growth = max([1.0, *(float(np.mean(one)) for one in own if one is not None)])
             response, scatter = changes.mean(axis=0), data.scatter(changes) if draws else None
+            if draws or known:  # its scatter is in the covariance
+                pair = None
         except InputError:
             response = t @ theta
-        if draws:  # its scatter is in the covariance
-            pair = None
         acting = None if draws else refined.candidates[member].acting
         variance = 1.0 if acting is None else 1.0 + max(acting.own, 0.0)
         action = Action.of(response, t, theta, variance * covariance, scatter)

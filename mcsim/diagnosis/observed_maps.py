@@ -49,7 +49,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
     @cached_property
     def same_skies(self) -> SameSkies:
         """Return what simulates responses."""
-        return SameSkies(self.context.analysis, self.ask, self.data)
+        return SameSkies(self.context.analysis, self.ask, self.data, self.context.noise)
 
     def respond(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return changes of the data vector in ``skies`` skies, shape (rows, p)."""
@@ -81,7 +81,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         before, after = self.context.extended_reference(found), self.same_skies.of_reference(found)
         if left := self.same_skies.dipole_left(found):
             apart, together = self.same_skies.pair(left, self.context.settings.constrained_skies, constrained=True)
-            typical = self.same_skies.of_reference(left) - before
+            typical = self.same_skies.of_reference(left) - self.context.extended_reference(left)
             after = after - typical + np.resize(together - apart, typical.shape)
         return before, after
 
@@ -150,7 +150,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
             # What is left out is filled, and departs from no model.
             if max(map(share_left_out, parts, maps)) > context.settings.missing_share:
                 return 0.0
-            return context.null.pvalue(context.analysis.data_vector(maps))
+            return context.of_model.null.pvalue(context.analysis.data_vector(maps))
 
         if (p := pvalue([healpy.reorder(one, n2r=True) for one in self.data])) > level:
             notes.append(f"The model fits (p = {p:.2g}) with maps read in the order NESTED; say so in their headers.")
@@ -178,7 +178,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
 
     def places(self) -> list[Place]:
         """Rank the bipolar scan, and those elements of the data vector that are no matched filters."""
-        ensemble, analysis = self.context.ensemble, self.context.analysis
+        ensemble, analysis = self.context.of_model.ensemble, self.context.analysis
         own = [i for i, element in enumerate(analysis.elements) if element.statistic != "score"]
         count = len(ensemble.bipolar_scan)
         drawn = np.concatenate([ensemble.bipolar_scan, ensemble.simulations[:count][:, own]], axis=1)

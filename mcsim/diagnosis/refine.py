@@ -260,7 +260,7 @@ class Refiner:
             now.t[:, columns] += beyond(self.context.null, now.t[:, columns], at, changes.mean(axis=0))
         if stochastic:
             now.candidates[index] = replace(candidate, scatter=self.data.scatter(changes), shape_error=None)
-        elif pair is not None:
+        elif pair is not None and not self.context.knows(there):
             acting = Acting.of(self.context.null, now.t, [one.columns for one in now.candidates], index, pair)
             now.candidates[index] = replace(candidate, acting=acting)
         return True

@@ -83,15 +83,19 @@ def assert_power_of(plain, jobs):
     assert np.all(np.abs(np.mean(found, axis=0) - mean) < 5.0 * error + NEARLY * mean)
 
 
-@pytest.mark.parametrize("amplitude", [0.6, -0.6], ids=["wider", "narrower"])
-def test_skies_scatter_by_as_much_as_a_beam_hides(amplitude):
-    """Of degrees that a wider beam hides, less is known than the filter of the model knows, which adds the scatter."""
+@pytest.mark.parametrize(
+    ("name", "amplitude"),
+    [("beam_width", 0.6), ("beam_width", -0.6), ("noise_level", 2.0), ("noise_level", -0.6)],
+    ids=["wider", "narrower", "noisier", "quieter"],
+)
+def test_skies_scatter_by_as_much_as_an_effect_hides(name, amplitude):
+    """Of degrees that a beam or noise hides, less is known than by the filter of the model, which adds scatter."""
     table = two_channels("hidden", lmax=5 * NSIDE // 2, nside=NSIDE, fwhm_arcmin=600.0, sigma0_uk=40.0)
     table["biposh"]["lmax"] = 2 * NSIDE
     run = config.load(table)
     analysis = analysis_of(run, settings=DiagnosisSettings())
     names = [channel.name for channel in run.channels]
-    found = [config.Effect(name="beam_width", channel=one, parameters={"amplitude": amplitude}) for one in names]
+    found = [config.Effect(name=name, channel=one, parameters={"amplitude": amplitude}) for one in names]
     observed = survey(with_effects(run, found))
     jobs = []
     for realization in range(SIMULATIONS, SIMULATIONS + DATA):

@@ -97,9 +97,8 @@ def test_each_effect_of_a_set_scatters_the_skies_in_which_its_response_is_measur
 
     data: Any = SimpleNamespace(same_skies=same, pair=pair)
     data.in_same_skies = lambda found: ObservedMaps.in_same_skies(data, found)
-    data.context = SimpleNamespace(
-        null=null, candidates=candidates, templates=t, settings=SimpleNamespace(nonlinear_sigma=0.5)
-    )
+    known = {"null": null, "templates": t, "settings": SimpleNamespace(nonlinear_sigma=0.5)}
+    data.context = SimpleNamespace(candidates=candidates, knows=lambda table: False, **known)
     fit = null.fit(t @ [0.2, 0.1], t)
     found = _scattered(data, [0, 1], t, [], fit)
     assert sorted(asked) == [("calibration",), ("spectrum",)]

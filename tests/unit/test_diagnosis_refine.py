@@ -85,9 +85,8 @@ class Instrument:
 
     def refined(self, x: np.ndarray, sets=()):
         bank = SimpleNamespace(curvature=self.curvature)
-        context = SimpleNamespace(
-            null=self.null, templates=self.t, calibration=self.calibration, bank=bank, settings=self.settings
-        )
+        known = {"null": self.null, "templates": self.t, "calibration": self.calibration, "settings": self.settings}
+        context = SimpleNamespace(bank=bank, knows=lambda table: False, **known)
         own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter, "changes_sky": lambda tables: False}
         own["dipole_snr"] = lambda tables: float(tables[0].channel in self.crossed)
         groups = self.null.whiten_groups(self.t, [one.columns for one in self.candidates])

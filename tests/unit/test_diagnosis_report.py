@@ -105,7 +105,7 @@ def bench(nearest_candidates: bool) -> SimpleNamespace:
     model = SimulatedGaussian.from_simulations(simulations)
     spread = np.random.default_rng(12).normal(size=(5, 2))
     fiducial = SimpleNamespace(frame="ecliptic", parts=[SimpleNamespace(name=name) for name in (EVIL, "V")])
-    return SimpleNamespace(
+    context = SimpleNamespace(
         run=replace(config.load(resources.workflow("quickstart")), name=EVIL),
         analysis=SimpleNamespace(elements=tuple(elements()), model=fiducial),
         settings=DiagnosisSettings(beam_bins=(5, 2, 2, 1, 1), place_pvalue=0.0123),
@@ -117,6 +117,8 @@ def bench(nearest_candidates: bool) -> SimpleNamespace:
         ),
         templates=t,
     )
+    context.of_model = context
+    return context
 
 
 def diagnosis(kind: str) -> DiagnosisResult:

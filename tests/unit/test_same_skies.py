@@ -113,11 +113,11 @@ def test_the_sky_of_maps_with_an_ellipse_is_found_through_it() -> None:
         names = ("V1", "W1") if both else ("W1",)
         ellipse = [config.Effect(name="beam_ellipticity", channel=name, parameters=parameters) for name in names]
         skies = SameSkies(analysis, list, list(simulate.maps(survey(with_effects(run, ellipse)), 0)))
-        circular = skies._through(skies.factors(ellipse), skies.maps)
+        circular = skies._through(skies.factors(ellipse), (), skies.maps)
         off, left = (np.linalg.norm(one - expected) for one in (circular, skies.observed_with(ellipse)))
         assert left < 0.3 * off
     slight = [config.Effect(name="beam_ellipticity", channel="W1", parameters={"amplitude": 0.02})]
-    assert skies.seen(slight) == ((), (), "")
+    assert skies.seen(slight) == ((), (), (), "")
 
 
 ADDED = [
@@ -144,7 +144,7 @@ def test_the_sky_of_maps_with_added_signals_is_found_without_them(
     assert off > 0.2 * np.linalg.norm(expected)
     step = analysis.candidates[0].basis[0].amplitude
     small = [config.Effect(name=name, channel=channel, parameters={**parameters, "amplitude": step})]
-    assert skies.seen(small) == ((), (), "")
+    assert skies.seen(small) == ((), (), (), "")
 
 
 def test_the_dipole_that_a_gain_leaves_in_the_only_channel_is_a_residual_one() -> None:
