@@ -97,20 +97,23 @@ def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> At
         t = refined.templates[:, columns_of(context.candidates, one.members)]
         scatters = scatters_of(refined.candidates, one.members)
         null = context.null.with_extra_covariance(*scatters)
-        scattered = [partial(_scattered, data, one.members, t, scatters)] if best else []
+        drawn = [k for k in one.members if refined.candidates[k].scatter is not None]
+        scattered = [partial(_scattered, data, one.members, t, scatters, drawn)] if best else []
         return replace(one, fit=with_priors(null, t, one.fit, members, *scattered))
 
     return replace(found, explanations=tuple(errors(one, place == 0) for place, one in enumerate(every)))
 
 
-def _scattered(data: DataSet[Any], members: Sequence[int], t: Matrix, scatters: Sequence[Matrix], first: Fit) -> Fit:
+def _scattered(
+    data: DataSet[Any], members: Sequence[int], t: Matrix, scatters: Sequence[Matrix], drawn: Sequence[int], first: Fit
+) -> Fit:
     """Return the fit of a set with the errors that its amplitudes have with its effects in the data.
 
-    ``t`` are its templates, shape (p, K), and ``scatters`` those with which the fit was made.
+    ``t`` are its templates, shape (p, K), and ``scatters``, of the members ``drawn``, those with which it was made.
     """
     context, fit = data.context, first
     if scatters:
-        return with_drawn_scatter(context.null, t, fit, scatters)
+        return with_drawn_scatter(context.null, t, fit, scatters, [_alone(data, members, k, first) for k in drawn])
     with suppress(InputError):  # between what was fitted and what can be
         acting = tables_at(context.candidates, members, first)
         groups, unknown = data.in_same_skies(acting), [one for one in acting if not context.knows(one)]
@@ -121,6 +124,21 @@ def _scattered(data: DataSet[Any], members: Sequence[int], t: Matrix, scatters: 
         tables = tables_beside(context.candidates, members, first, bend, context.settings.nonlinear_sigma)
         fit = with_tangents(context.null, t, fit, [_slope(data, groups, pairs, *one) for one in tables])
     return fit
+
+
+def _alone(data: DataSet[Any], members: Sequence[int], drawn: int, first: Fit) -> Matrix | None:
+    """Return deviations of data without a member of a fit, in the skies of its scatter; None if it draws a pattern."""
+    context = data.context
+    candidate = context.candidates[drawn]
+    (part,) = (own for own in parts_of(context.candidates, members, first) if own[0] == drawn)
+    if candidate.parametrization.stochastic:
+        return None
+    try:
+        table = candidate.table(candidate.detected(*part[1:]))
+    except InputError:
+        return None
+    before, _ = data.pair_extended([table], context.settings.scatter_skies)
+    return data.scatter(before[:, : len(data.x)])
 
 
 def _pairs(data: DataSet[Any], groups: Sequence[Sequence[config.Effect]]) -> list[tuple[Matrix, Matrix]]:

@@ -18,6 +18,11 @@ from mcsim.support.arrays import Matrix, Vector
 
 ALIKE = 0.7  #: cosine of linear responses from which on one candidate can pass for another
 STEEPEST = 9.0  #: a response is never taken to grow with more than the tenth power of its amplitude
+WIDE = 8.0
+"""Variance that an effect adds along its own response, over that without it, from which on its scatter is drawn: what
+it makes of noise and of the part of the sky that is not known, and what is like it makes otherwise, is no small part of
+the difference of the two then."""
+
 NEARLY = 0.8  #: share of what the best single candidate explains, from which on others are tried that explain less
 
 
@@ -262,7 +267,11 @@ class Refiner:
             now.candidates[index] = replace(candidate, scatter=self.data.scatter(changes), shape_error=None)
         elif pair is not None and not self.context.knows(there):
             acting = Acting.of(self.context.null, now.t, [one.columns for one in now.candidates], index, pair)
-            now.candidates[index] = replace(candidate, acting=acting)
+            if acting.own <= WIDE or how.noise_alone:
+                now.candidates[index] = replace(candidate, acting=acting, scatter=None)
+            elif candidate.scatter is None or done is None or _has_moved(done, at):
+                drawn = self.data.respond([there], self.context.settings.scatter_skies)
+                now.candidates[index] = replace(candidate, acting=None, scatter=self.data.scatter(drawn))
         return True
 
     def _has_been(self, now: "_Responses", index: int, coordinates: Vector, covariance: Matrix) -> bool:
@@ -285,7 +294,7 @@ class Refiner:
         return [
             index
             for index, done in now.done.items()
-            if now.candidates[index].scatter is None
+            if not now.candidates[index].parametrization.stochastic
             and (alone := found.singles[index]).delta_chi2 < first.singles[index].delta_chi2
             and not has_settled(self.context.settings, done, alone.amplitudes, alone.covariance)
         ]
@@ -410,6 +419,11 @@ def _steepness(before: tuple[Vector, Vector], now: tuple[Vector, Vector], covari
     moved, fitted = now[0] - before[0], now[1] - before[1]
     size = float(moved @ precision @ moved)
     return float(np.clip(-(moved @ precision @ fitted) / size, 0.0, STEEPEST)) if size > 0.0 else 0.0
+
+
+def _has_moved(before: Vector, now: Vector) -> bool:
+    """Return True if coordinates have moved by more than a tenth, and so has what they scatter."""
+    return bool(np.linalg.norm(now - before) > 0.1 * np.linalg.norm(now))
 
 
 def _nearly_best(explained: Vector, ranked: Sequence[int], least: int) -> Sequence[int]:

@@ -19,6 +19,8 @@ from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
 from mcsim.stats.scattered import Acting, Groups, variance_beside
 from mcsim.support.arrays import Matrix, Rows, Vector
 
+SCATTERED = 2  #: members of a set at most whose scatter is known
+
 Verdict = Literal["none", "effect", "mixture", "degenerate", "unknown"]
 
 
@@ -281,12 +283,13 @@ class Selection:
 
     @cached_property
     def searches(self) -> list[Subsets]:
-        """Return a search of sets without a member whose scatter is known, and one of each combination of such members.
+        """Return a search of sets without a member whose scatter is known, and of each combination of few such members.
 
         Combinations of candidates that exclude each other are left out.
         """
         scatters = [index for index, candidate in enumerate(self.candidates) if candidate.scatter is not None]
-        sets = [members for size in range(self.settings.max_effects + 1) for members in combinations(scatters, size)]
+        most = min(SCATTERED, self.settings.max_effects)
+        sets = [members for size in range(most + 1) for members in combinations(scatters, size)]
         return [self.search(own) for own in sets if len({self.candidates[k].identity for k in own}) == len(own)]
 
     def search(self, members: Sequence[int]) -> Subsets:

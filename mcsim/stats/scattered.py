@@ -178,18 +178,21 @@ def with_tangents(null: SimulatedGaussian, t: Matrix, found: Fit, tangents: Sequ
     return replace(found, covariance=move @ found.covariance @ move.T)
 
 
-def with_drawn_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, scatters: Sequence[Matrix]) -> Fit:
+def with_drawn_scatter(
+    null: SimulatedGaussian, t: Matrix, found: Fit, scatters: Sequence[Matrix], alone: Sequence[Matrix | None] = ()
+) -> Fit:
     """Return a fit of templates, shape (p_raw, K), with the errors that patterns which are drawn give its amplitudes.
 
     ``null`` is the distribution without them; ``scatters``, with which it was widened for the fit, are deviations as of
-    :meth:`SimulatedGaussian.with_extra_covariance`.
+    :meth:`SimulatedGaussian.with_extra_covariance`. ``alone`` are those of the data vectors of the same skies without
+    them, where these are correlated with what is drawn.
 
     Notes
     -----
     The weights of the fit avoid the scatter of the very draws that it is known from: these would make errors too small.
     Each draw is fitted with the scatter of all others, and the mean square of what it adds to the amplitudes stands in
-    place of the scatter (leave-one-out cross-validation; Stone, JRSS B 36, 111, 1974). Pulls:
-    tests/statistical/test_drawn_scatter.py.
+    place of the scatter (leave-one-out cross-validation; Stone, JRSS B 36, 111, 1974). What is correlated with the data
+    adds their product, too. Pulls: tests/statistical/test_drawn_scatter.py.
     """
     white, scale = np.linalg.pinv(null.whitening), (null.dof + found.chi2) / (found.dof - 2)
 
@@ -199,13 +202,17 @@ def with_drawn_scatter(null: SimulatedGaussian, t: Matrix, found: Fit, scatters:
         return np.asarray(back @ basis.T @ wide.whitening / np.sqrt(1.0 + 1.0 / null.n_sims))
 
     own = weights(scatters) @ white * np.sqrt(1.0 + 1.0 / null.n_sims)
-    covariance = scale * own @ own.T
+    covariance, crossed = scale * own @ own.T, np.zeros(found.covariance.shape)
     for place, draws in enumerate(scatters):
+        data = alone[place] if alone else None
         for k in range(draws.shape[1]):
             others = [*scatters[:place], without(draws, k), *scatters[place + 1 :]]
-            added = weights(others) @ draws[:, k]
+            each = weights(others)
+            added = each @ draws[:, k]
             covariance += np.outer(added, added)
-    return replace(found, covariance=covariance)
+            crossed += 0.0 if data is None else np.outer(added, each @ data[:, k])
+    both = covariance + crossed + crossed.T
+    return replace(found, covariance=both if np.linalg.eigvalsh(both)[0] > 0.0 else covariance)
 
 
 def variance_beside(

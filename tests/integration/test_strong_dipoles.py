@@ -1,4 +1,4 @@
-"""A residual dipole far above the noise of smoothed maps: most of what it does is in squares of the maps."""
+"""Residual dipoles and calibration errors far above the noise: most of what they do is in squares of the maps."""
 
 import pytest
 
@@ -24,3 +24,15 @@ def test_a_strong_dipole_has_its_size(model, amplitude):
     assert (verdict.kind, one.name, one.channel) == ("effect", "dipole_residual", "W1")
     assert abs(one.amplitude - amplitude) < 3.0 * one.sigma
     assert one.sigma < 0.1 * amplitude
+
+
+def test_a_bright_calibration_error_is_no_dipole():
+    """It leaves one of 101 uK, of whose products with noise the covariance of the model knows nothing."""
+    table = two_channels("bright", sigma0_uk=30.0)
+    model = learned(table, "calibration", "beam_width", "dipole_residual", "noise_level", "beam_sidelobe")
+    maps = list(simulate.maps(data_of(model.run, "calibration", "W1", amplitude=0.03), 1))
+    verdict = diagnose_data(ObservedMaps(model, maps, ask), "calibration")
+    ((one,),) = (each.effects for each in verdict.sets)
+    assert (verdict.kind, one.name, one.channel) == ("effect", "calibration", "W1")
+    assert abs(one.amplitude - 0.03) < 4.0 * one.sigma
+    assert one.sigma < 1e-4

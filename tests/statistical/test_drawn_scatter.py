@@ -29,6 +29,25 @@ def test_pulls_beside_drawn_patterns_have_unit_width() -> None:
     np.testing.assert_allclose(widths, 1.0, atol=3.5 / np.sqrt(2.0 * TRIALS))
 
 
+def test_pulls_have_unit_width_where_noise_is_in_what_is_drawn() -> None:
+    """A strong response multiplies noise, so that what it adds is correlated with the data without it."""
+    rng, draws = np.random.default_rng(20140318), 24
+    t, truth = rng.normal(size=(P, 2)), np.array([10.0, 4.0])
+    gains = 2.0 * t @ np.linalg.pinv(t)  # along the templates noise is three times what it is without the response
+    pulls = []
+    for _ in range(TRIALS):
+        null = SimulatedGaussian.from_simulations(rng.normal(size=(SIMULATIONS, P)))
+        noise, own = rng.normal(size=(P, draws)), rng.normal(size=P)
+        without = (noise - noise.mean(axis=1, keepdims=True)) * np.sqrt((1.0 + 1.0 / draws) / (draws - 1.0))
+        scatter, x = gains @ without, t @ truth + own + gains @ own
+        found = null.with_extra_covariance(scatter).fit(x, t)
+        each = [with_drawn_scatter(null, t, found, [scatter], alone).errors for alone in ([None], [without])]
+        pulls.append([(found.amplitudes - truth) / errors for errors in each])
+    ignored, known = np.sqrt(np.mean(np.square(pulls), axis=0))
+    np.testing.assert_allclose(known, 1.0, atol=3.5 / np.sqrt(2.0 * TRIALS))
+    assert np.all(ignored > known)
+
+
 def test_what_is_found_beside_a_drawn_pattern_is_as_rare_as_it_says() -> None:
     """A power law of modes, of which 24 draws hardly tell the weaker ones, along which other templates lie."""
     rng, draws, trials, beside, level = np.random.default_rng(20140317), 24, 200, 12, 0.01
