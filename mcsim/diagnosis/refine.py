@@ -294,7 +294,7 @@ class Refiner:
         return [
             index
             for index, done in now.done.items()
-            if not now.candidates[index].parametrization.stochastic
+            if (now.candidates[index].scatter is None or not now.candidates[index].parametrization.stochastic)
             and (alone := found.singles[index]).delta_chi2 < first.singles[index].delta_chi2
             and not has_settled(self.context.settings, done, alone.amplitudes, alone.covariance)
         ]
