@@ -59,7 +59,7 @@ class DiagnosisContext:
 
     def knows(self, one: config.Effect) -> bool:
         """Return True for an effect whose noise is in the scatter of the null distribution."""
-        return not without_repeats(self.noise, [one]) and bool(self.noise)
+        return bool(self.noise) and not without_repeats(self.noise, [one])
 
     @property
     def of_pixel_means(self) -> "DiagnosisContext":
@@ -73,7 +73,7 @@ class DiagnosisContext:
 
     def extended_reference(self, found: Sequence[config.Effect]) -> Matrix:
         """Return those of :meth:`reference` with the numbers beside the data vector behind it, (skies, p + E)."""
-        if self.noise and not without_repeats(self.noise, found):
+        if any(map(self.knows, found)):
             return self.of_model.extended_reference(found)
         if self.analysis.source_of(found) is None:
             return self.ensemble.extended.reference

@@ -107,14 +107,15 @@ def _actions(data: DataSet[Any], refined: Refined, one: Explanation) -> Iterator
         pair: tuple[Matrix, Matrix] | None = None
         try:
             effect = candidate.detected(theta, covariance)
-            pair = data.pair_extended([candidate.table(effect)], skies)
-            changes = pair[1] - pair[0]
+            table = candidate.table(effect)
+            simulated = data.pair_extended([table], skies)
+            changes = simulated[1] - simulated[0]
             own = (effect.noise(one.site) for one in sites if candidate.channel in (None, one.site.channel))
-            if not (known := context.knows(candidate.table(effect))):
+            if not (known := context.knows(table)):
                 growth = max([1.0, *(float(np.mean(one)) for one in own if one is not None)])
             response, scatter = changes.mean(axis=0), data.scatter(changes) if draws else None
-            if draws or known:  # its scatter is in the covariance
-                pair = None
+            if not (draws or known):  # else its scatter is in the covariance
+                pair = simulated
         except InputError:
             response = t @ theta
         acting = None if draws else refined.candidates[member].acting

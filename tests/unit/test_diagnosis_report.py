@@ -112,9 +112,7 @@ def bench(nearest_candidates: bool) -> SimpleNamespace:
         ensemble=SimpleNamespace(**held, residual_rms=1.0 + 0.1 * spread, nuisances=None),
         null=model,
         candidates=candidates,
-        calibration=calibrate(
-            model, model.whiten_groups(t, [candidate.columns for candidate in candidates]), draws=2000
-        ),
+        calibration=calibrate(model, model.whiten_groups(t, [one.columns for one in candidates]), draws=2000),
         templates=t,
     )
     context.of_model = context
