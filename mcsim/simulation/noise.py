@@ -18,7 +18,7 @@ from mcsim.simulation import timestream
 from mcsim.simulation.channels import scan_model
 from mcsim.sphere import header, healpix
 from mcsim.sphere.checks import UNSEEN_BELOW, check_not_infinite
-from mcsim.sphere.mask import read_mask
+from mcsim.sphere.mask import kept_mask
 from mcsim.support.arrays import Map, divided
 
 SMALLEST_UK2 = 1e-8
@@ -184,7 +184,7 @@ def _difference(
         hits = np.stack([_positive(path, moments, healpix.HITS, bool(noise.hits))[0] for path in given])
     used = np.all(np.isfinite(maps) & (hits > 0.0), axis=0)
     if noise.mask is not None:
-        mask = read_mask(config.channel_path(noise.mask, spec.name), moments.nside, moments.frame, run.map.mask_frame)
+        mask = kept_mask(config.channel_path(noise.mask, spec.name), moments.nside, moments.frame, run.map.mask_frame)
         used &= mask > 0.0
     if used.sum() < len(maps) + 1:
         raise InputError(

@@ -21,9 +21,8 @@ from mcsim.simulation.channels import load_beam
 from mcsim.simulation.steps import NEGLIGIBLE, Average, Filled, Filter, Regression, Rotated, Step, Weighted
 from mcsim.sphere import healpix, rotation
 from mcsim.sphere.checks import UNSEEN_BELOW, check_complete, check_map
-from mcsim.sphere.mask import read_mask
+from mcsim.sphere.mask import kept_mask
 from mcsim.support.arrays import Map
-from mcsim.support.loading import once_per_content
 from mcsim.systematics import Site
 
 LARGEST_GAIN = 10.0  #: of B_l by a change of the beam: a target that asks for more is narrower than the beam
@@ -234,7 +233,7 @@ def _step(step: declared.Step, spec: config.Channel, split: str | None, nside: i
     def mask(path: str | None, mask_frame: str | None) -> Map:
         if path is None:
             return np.ones(12 * nside**2)
-        return _read_mask(config.channel_path(path, spec.name, split), nside, frame, mask_frame)
+        return kept_mask(config.channel_path(path, spec.name, split), nside, frame, mask_frame)
 
     match step:
         case declared.Degrade(method="average"):
@@ -321,10 +320,3 @@ def _template(path: Path, nside: int, frame: str, spec: config.Channel) -> Map:
     check_map(template, nside, f"template {path}")
     check_complete(template, f"template {path}")
     return template
-
-
-@once_per_content(32)
-def _read_mask(path: Path, nside: int, frame: str, mask_frame: str | None) -> Map:
-    mask = read_mask(path, nside, frame, mask_frame)
-    mask.setflags(write=False)
-    return mask

@@ -35,7 +35,7 @@ from mcsim.simulation.survey_filter import filtering_of
 from mcsim.simulation.timestream import CorrelatedNoise
 from mcsim.sphere import healpix, rng, spectra
 from mcsim.sphere.checks import check_whole
-from mcsim.sphere.mask import read_mask
+from mcsim.sphere.mask import kept_mask
 from mcsim.support.arrays import divided
 from mcsim.support.loading import once_per_content
 from mcsim.systematics import Effect, Library, Site, acts_through, seen_through, spread_of, variance_factor
@@ -423,7 +423,7 @@ def _weight(
     mask = spec.mask or run.map.mask
     if mask is not None:
         path = config.channel_path(mask, spec.name, split)
-        weight *= read_mask(path, moments.nside, moments.frame, run.map.mask_frame, run.map.mask_apodisation_deg)
+        weight *= kept_mask(path, moments.nside, moments.frame, run.map.mask_frame, run.map.mask_apodisation_deg)
     if done is not None:
         weight *= done
     if not weight.any():

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from mcsim.errors import InputError
 from mcsim.sphere import healpix, rotation
 from mcsim.sphere.checks import check_map, check_nside
+from mcsim.support.loading import once_per_content
 
 Mask = NDArray[np.float64]
 
@@ -55,6 +56,14 @@ def read_mask(
     if found > nside:
         mask = healpy.ud_grade(mask, nside)
     return apodise(mask, np.deg2rad(apodisation_deg))
+
+
+@once_per_content(32)
+def kept_mask(path: Path, nside: int, frame: str, mask_frame: str | None = None, apodisation_deg: float = 0.0) -> Mask:
+    """Read a mask (:func:`read_mask`) once for all surveys of a process; the weights cannot be written to."""
+    mask = read_mask(path, nside, frame, mask_frame, apodisation_deg)
+    mask.setflags(write=False)
+    return mask
 
 
 def apodise(mask: Mask, width: float) -> Mask:

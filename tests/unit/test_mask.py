@@ -30,6 +30,18 @@ def test_as_it_is(write):
     np.testing.assert_array_equal(mask.read_mask(write(nested, nest=True), 8), values)
 
 
+def test_a_kept_mask_is_read_again_once_its_file_is_another(write):
+    path = write(np.ones(48))
+    first = mask.kept_mask(path, 2, "ecliptic")
+    assert mask.kept_mask(path, 2, "ecliptic") is first
+    assert not first.flags.writeable
+    assert np.array_equal(first, mask.read_mask(path, 2))
+    soft = mask.kept_mask(path, 4, "ecliptic", None, 5.0)
+    assert soft.shape == (192,)
+    path = write(np.append(np.zeros(100), np.ones(92)))
+    assert mask.kept_mask(path, 2, "ecliptic").min() == 0.0
+
+
 def test_another_resolution(write):
     """Finer maps see the coarse pixel that they lie in; coarser ones the mean of the fine pixels in them."""
     path = write(band(8))
