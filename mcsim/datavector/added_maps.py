@@ -40,15 +40,19 @@ class AddedMaps:
         pairs = zip(maps, self._shown(run), strict=True)
         return [np.where((own == healpy.UNSEEN) | (m == healpy.UNSEEN), m, m - own) for m, own in pairs]
 
+    def is_small(self, effect: config.Effect) -> bool:
+        """Return True for an effect as small as in the simulations from which linear responses are measured."""
+        kind = dict(self.analysis.library)[effect.name]
+        amplitude = systematics.build(kind, dict(effect.parameters)).amplitude
+        return abs(amplitude) <= self._steps.get((effect.name, effect.channel), 0.0)
+
     def _adds(self, effect: config.Effect) -> bool:
         """Return True if an effect can add to maps: to the sky, to samples, or as it changes how a dipole is seen.
 
-        What is drawn anew in every realization is not known, and what is as small as in the simulations from which
-        linear responses are measured is little.
+        What is drawn anew in every realization is not known, and what is small is little.
         """
         kind = dict(self.analysis.library)[effect.name]
-        amplitude = systematics.build(kind, dict(effect.parameters)).amplitude
-        if kind.parametrization.stochastic or abs(amplitude) <= self._steps.get((effect.name, effect.channel), 0.0):
+        if kind.parametrization.stochastic or self.is_small(effect):
             return False
         dipole = any(channel.site.dipole_uk.any() for channel in self.analysis.model.survey.channels)
         return systematics.acts_through(kind, "sky", "signal") or (dipole and not kind.parametrization.noise_alone)

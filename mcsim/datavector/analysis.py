@@ -289,6 +289,7 @@ class Job:
     slices: bool = False  # measure the numbers beside the data vector as well
     observed: Alm | None = None  # filtered sky of the data, which then constrains the skies
     spread: Cl | None = None  # of skies about the observed one, over that without effects, by degree: (lmax + 1,)
+    negative: bool = False  # turn the sign of these skies
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
     library: Kinds = field(default_factory=lambda: kinds_of(None))
     source: Source | None = None  # simulates in place of mcsim
@@ -300,6 +301,11 @@ class Job:
     def definition(self) -> tuple[str, tuple[str, ...], DiagnosisSettings, Kinds, str]:
         """Return what the analysis follows from."""
         return self.fiducial, self.without, self.settings, self.library, self.content
+
+    @property
+    def given(self) -> bytes:
+        """Return what tells the skies that data constrain from those of other data; b"" without data."""
+        return b"" if self.observed is None else bytes([self.negative]) + self.observed.tobytes()
 
 
 def data_vectors(job: Job, library: Library | None = None) -> Vector:
@@ -326,6 +332,7 @@ def simulated_maps(job: Job, library: Library | None = None) -> Iterator[list[Ma
         if job.observed is not None:
             seed, _ = _seed_and_added(job.simulated, job.fiducial)
             sky = _constrained_sky(job.definition, job.observed, seed, realization, job.spread)
+            sky = -sky if job.negative else sky
         if job.source is not None:
             yield external_maps(job, realization, sky)
         elif job.nuisances:
@@ -334,7 +341,7 @@ def simulated_maps(job: Job, library: Library | None = None) -> Iterator[list[Ma
             which = (
                 without_effects(job.simulated),
                 job.library if library is None else kinds_of(library),
-                0 if job.observed is None else hash(job.observed.tobytes()),
+                hash(job.given),
                 job.content,
             )
             yield _untouched().maps(shared, realization, sky, which)

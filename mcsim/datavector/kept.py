@@ -84,6 +84,6 @@ class Kept:
         ]
         if job.observed is not None:
             # Skies that the data constrain are those of no other data.
-            kind.append(hashlib.sha256(job.observed.tobytes()).hexdigest())
+            kind.append(hashlib.sha256(job.given).hexdigest())
         text = json.dumps([run["effect"], run["channel"], run["ensemble"]["seed"], kind])
         return self.folder / hashlib.sha256(text.encode()).hexdigest()[:32]

@@ -19,6 +19,8 @@ from mcsim.instrument.beams import Beam
 from mcsim.simulation import convolve
 from mcsim.simulation.channels import table_of
 from mcsim.simulation.survey import Channel
+from mcsim.sphere import alm as alm_
+from mcsim.sphere import rotation
 from mcsim.sphere.alm import degrees, orders
 from mcsim.support.arrays import Alm, Cl, Map, Matrix, Vector, divided
 from mcsim.systematics.added import DipoleResidual
@@ -29,7 +31,9 @@ BENT = 0.1  #: change of a beam at some degree, beside a gain, that observed ski
 
 NOISY = 0.2  #: change of the variance of noise that the filter of observed skies need not know
 
-ROUNDS, STILL = 8, 1e-3  #: of finding a sky that is seen through other orders of beams, and relative change at the end
+ROUNDS, STILL = 8, 1e-3  #: of finding a sky that effects change otherwise, and relative change at the end
+
+FEW = 32  #: degrees of a sky that tell if effects make means of it
 
 Factors = tuple[tuple[float, ...], ...]  #: by which channels see degrees otherwise, (channel, lmax + 1); (): not
 
@@ -38,7 +42,10 @@ Orders = tuple[bytes, ...]
 
 Noise = tuple[float, ...]  #: factors of the variance of the noise of channels; (): about one
 
-Seen = tuple[Factors, Noise, Orders, Added]  #: how channels see a sky otherwise, and what maps show besides
+Turned = str  #: run (JSON) whose effects turn the sky that all channels see into another; "": they do little
+
+Seen = tuple[Factors, Noise, Orders, Added, Turned]
+"""How channels see a sky otherwise, what maps show besides, and what was done to the sky itself."""
 
 Skies = Literal["reference", "typical", "constrained"]
 
@@ -55,8 +62,8 @@ class SameSkies:
     maps: Sequence[Map]
     noise: Sequence[config.Effect] = ()  # that all simulations have, but for those with such effects of their own
     # Data vectors without any effect but noise, as many as were needed so far. Keys are True for constrained skies, for
-    # an external simulator, and with noise, and how the maps were seen that constrain them.
-    _before: dict[tuple[bool, bool, bool, Seen], list[Vector]] = field(
+    # an external simulator, with noise, and for negative skies, and how the maps were seen that constrain them.
+    _before: dict[tuple[bool, bool, bool, bool, Seen], list[Vector]] = field(
         default_factory=lambda: defaultdict(list), init=False
     )
     # What was simulated ahead, by all that tells such jobs apart.
@@ -78,7 +85,8 @@ class SameSkies:
         the sky, which is in the filtered one with a weight, too: it is computed from the sky that is found, and taken
         from the maps, until that sky changes no more. Other noise changes the weights. What effects show without a sky,
         a foreground or a residual dipole behind a mask, is simulated and taken from the maps first. Where a sky has a
-        part of it already, the effect adds more than it did to the data, and the fit too little.
+        part of it already, the effect adds more than it did to the data, and the fit too little. A modulation of the
+        sky itself is undone in what was filtered: a fit would be too small by the square of its amplitude.
         """
         return self._skies(self.seen(found))
 
@@ -92,7 +100,7 @@ class SameSkies:
 
     def _sky(self, seen: Seen) -> Alm:
         """Return the filtered sky of the maps if channels see it otherwise."""
-        factors, noise, orders, added = seen
+        factors, noise, orders, added, turned = seen
         maps = self._added.less(self.maps, added)
         found = before = self._through(factors, noise, maps)
         changed = np.inf
@@ -103,7 +111,22 @@ class SameSkies:
                 return before
             if changed < STILL:
                 break
-        return found
+        return self._turned_back(found, turned) if turned else found
+
+    def _turned_back(self, sky: Alm, turned: Turned) -> Alm:
+        """Return the sky of the model that effects of a run turn into a filtered one."""
+        run, model = config.from_json(turned), self.analysis.model
+        site, frame = replace(model.survey.channels[0].site, lmax=model.lmax), model.survey.config.map.frame
+        acting = self._acting(model.survey.channels[0], run.effects)
+        here = found = rotation.rotate_alm(sky, model.lmax, model.frame, frame)
+        alone = systematics.looked_at(acting, 0.0 * sky, site, 0, 0)  # is taken from the maps
+        for _ in range(ROUNDS):
+            change = systematics.looked_at(acting, found, site, 0, 0) - found - alone
+            # Nothing is filtered from maps at degrees where the sky has no power.
+            last, found = found, here - alm_.multiply(change, (model.cl > 0.0).astype(np.float64), model.lmax)
+            if np.linalg.norm(found - last) < STILL * np.linalg.norm(found):
+                break
+        return rotation.rotate_alm(found, model.lmax, frame, model.frame)
 
     def _through(self, factors: Factors, noise: Noise, maps: Sequence[Map]) -> Alm:
         """Return the filtered sky of maps whose degrees channels see otherwise, with other noise."""
@@ -153,7 +176,18 @@ class SameSkies:
 
     def seen(self, found: Sequence[config.Effect]) -> Seen:
         """Return how the channels see a sky otherwise with effects."""
-        return self.factors(found), self.noise_of(found), self.orders(found), self._added.run_of(found)
+        return (
+            self.factors(found),
+            self.noise_of(found),
+            self.orders(found),
+            self._added.run_of(found),
+            self.turned(found),
+        )
+
+    def turned(self, found: Sequence[config.Effect]) -> Turned:
+        """Return the run with those effects that turn the sky of all channels into another; "" if they do little."""
+        own = [one for one in found if one.channel is None and self.is_pattern(one) and not self._added.is_small(one)]
+        return config.to_json(replace(self.analysis.run, effects=tuple(own))) if own else ""
 
     def noise_of(self, found: Sequence[config.Effect]) -> Noise:
         """Return by how much effects change the variance of the noise of each channel; () if all is little."""
@@ -215,8 +249,9 @@ class SameSkies:
     def is_pattern(self, effect: config.Effect) -> bool:
         """Return True for an effect on the observed sky that makes a monopole or a dipole of its other degrees."""
         built = systematics.build(dict(self.analysis.library)[effect.name], dict(effect.parameters))
-        mixes = makes_means(built, self.analysis.model.survey.channels[0].site)
-        return mixes and self.skies_of(effect) == "constrained"
+        site = self.analysis.model.survey.channels[0].site
+        few = replace(site, lmax=min(site.lmax, FEW))
+        return self.skies_of(effect) == "constrained" and makes_means(built, few)
 
     def _changes_power(self, effect: config.Effect) -> bool:
         """Return True for what a beam, or a pixel, does to the power of the sky of the only channel."""
@@ -241,31 +276,47 @@ class SameSkies:
         effect = DipoleResidual(**DipoleResidual.parametrization.nearest(left, np.eye(3)))
         return [table_of(effect, self.analysis.model.channels[0])]
 
-    def ahead(self, each: Sequence[config.Effect], skies: int) -> None:
+    def ahead(self, each: Sequence[config.Effect], skies: int, odd: bool = False) -> None:
         """Simulate single effects at once that :meth:`of_reference` or :meth:`pair` will be asked for one by one.
 
+        ``odd``: :meth:`odd` will be.
         One by one they would leave workers waiting. InputError if one of them cannot be simulated.
         """
         kinds = [([*without_repeats(self.noise, [effect]), effect], self.skies_of(effect)) for effect in each]
         sets = [(found, kind == "constrained", None if kind == "reference" else skies) for found, kind in kinds]
         jobs = [job for one in sets for job in self._jobs(*one, there=one[0])]
+        jobs += [replace(job, negative=True) for job in jobs if odd]
         self._ahead.update(zip(map(_key, jobs), self.ask(jobs) if jobs else [], strict=True))
 
     def of_reference(self, found: Sequence[config.Effect]) -> Matrix:
         """Return data vectors with effects, of the skies with which responses are measured."""
         return self._simulated(self._jobs([*without_repeats(self.noise, found), *found], False, None))
 
-    def pair(self, found: Sequence[config.Effect], skies: int, constrained: bool) -> tuple[Matrix, Matrix]:
-        """Return data vectors of the same skies without effects and with them, which the observed maps have too."""
+    def pair(
+        self, found: Sequence[config.Effect], skies: int, constrained: bool, negative: bool = False
+    ) -> tuple[Matrix, Matrix]:
+        """Return data vectors of the same skies without effects and with them, which the observed maps have too.
+
+        ``negative``: of constrained skies with the other sign.
+        """
         noise = without_repeats(self.noise, found)
         there = [*noise, *found]
-        jobs = self._jobs(there, constrained, skies, there=there)
-        source, seen = jobs[0].source, self.seen(there) if constrained else ((), (), (), "")
-        before = self._before[constrained, source is not None, bool(noise), seen]
+        jobs = [replace(job, negative=negative) for job in self._jobs(there, constrained, skies, there=there)]
+        source, seen = jobs[0].source, self.seen(there) if constrained else ((), (), (), "", "")
+        before = self._before[constrained, source is not None, bool(noise), negative, seen]
         if (first := len(before)) < skies:
-            same = [replace(job, source=source) for job in self._jobs(noise, constrained, skies, first, there)]
+            same = self._jobs(noise, constrained, skies, first, there)
+            same = [replace(job, source=source, negative=negative) for job in same]
             before.extend(self._simulated(same)[first - skies :])
         return np.stack(before[:skies]), self._simulated(jobs)
+
+    def odd(self, found: Sequence[config.Effect], skies: int) -> Matrix:
+        """Return what changes of data vectors by effects have of the sign of constrained skies, shape (skies, p + E).
+
+        A dipole of our motion keeps its own: its products with the sky are in it, those of the sky with itself are not.
+        """
+        (before, after), (other, changed) = (self.pair(found, skies, True, negative) for negative in (False, True))
+        return 0.5 * ((after - before) - (changed - other))
 
     def _jobs(
         self,
@@ -302,4 +353,4 @@ def makes_means(effect: systematics.Effect, site: systematics.Site) -> bool:
 
 
 def _key(job: Job) -> tuple[str, int, int, bytes]:
-    return job.simulated, job.first, job.count, b"" if job.observed is None else job.observed.tobytes()
+    return job.simulated, job.first, job.count, job.given

@@ -47,11 +47,6 @@ class Element:
         return KINDS.get(self.kind, self.kind) + (f", order {self.L}" if self.kind == "beam" else "")
 
     @property
-    def odd(self) -> bool:
-        """Return True if the number has the sign of the maps: what multiplies the sky changes its mean by nothing."""
-        return self.kind in ODD
-
-    @property
     def unit(self) -> str:
         """Return the unit of the number, "1" for one without."""
         return UNITS.get(self.kind, "1")
@@ -106,9 +101,6 @@ KINDS = {
     "gain": "residual × sky at the largest scales",
 }
 """What the elements of the data vector measure, in words."""
-
-ODD = frozenset({"monopole", "dipole", "plane", "square", "residual"})
-"""What is an odd function of the maps."""
 
 UNITS = {
     "monopole": "uK^-1",

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 
 import healpy
 import numpy as np
@@ -122,8 +123,9 @@ class ObservedMaps(DataSet[Sequence[Map]]):
     def templates(self) -> Matrix:
         """Return the templates; those that depend on the very sky are measured on the observed one if it departs.
 
-        Of a modulation this holds for odd elements alone. In a part of the sky it is in part a gain, and products of
-        two maps of one sky respond as they fluctuate: behind a mask every sky looks like its own modulation.
+        Of a modulation this holds for what has the sign of the sky alone. In a part of the sky it is in part a gain,
+        and products of two maps of one sky respond as they fluctuate: behind a mask every sky looks like its own
+        modulation.
         """
         context, t, settings = self.context, self.context.templates.copy(), self.context.settings
         if self.gap.pvalue > settings.alpha:
@@ -131,13 +133,23 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         fixed = [c.random_response or c.nuisance or c.parametrization.mean_response for c in context.candidates]
         depends = ~np.array(fixed) & (context.sky_scatter >= settings.sky_scatter)
         own = [context.candidates[index] for index in np.flatnonzero(depends)]
-        odd = np.array([[element.odd] for element in context.analysis.elements])
-        for candidate, response in self.responses(own, settings.constrained_skies):
+        patterns = [self.same_skies.is_pattern(one.table(one.basis[0])) for one in own]
+        others = [one for one, odd in zip(own, patterns, strict=True) if not odd]
+        for candidate, response in self.responses(others, settings.constrained_skies):
             columns = list(candidate.columns)
-            straight = response[: len(t)] - context.bank.curvature[:, columns] * candidate.steps
-            rows = odd if self.same_skies.is_pattern(candidate.table(candidate.basis[0])) else True
-            t[:, columns] = np.where(rows, straight, t[:, columns])
+            t[:, columns] = response[: len(t)] - context.bank.curvature[:, columns] * candidate.steps
+        modulations = [one for one, odd in zip(own, patterns, strict=True) if odd]
+        for candidate, response in self._odd_responses(modulations, settings.constrained_skies):
+            t[:, list(candidate.columns)] += response[: len(t)]
         return t
+
+    def _odd_responses(self, candidates: Sequence[Candidate], skies: int) -> Iterator[tuple[Candidate, Matrix]]:
+        """Yield candidates with what of their responses has the sign of the observed sky, shape (p + E, K)."""
+        tables = [[one.table(effect) for effect in one.basis] for one in candidates]
+        self.same_skies.ahead([*chain(*tables)], skies, odd=True)
+        for one, each in zip(candidates, tables, strict=True):
+            changes = [self.same_skies.odd([table], skies).mean(axis=0) for table in each]
+            yield one, np.stack(changes, axis=1) / one.steps
 
     def exchanged(self, found: Attribution) -> list[str]:
         """Return orders of maps or pixels in which the model fits, unless it fits as they are or one effect does."""

@@ -236,12 +236,9 @@ def _generator(lmax: int) -> csr_array:
 
 
 LARGEST_MODULATION = 0.35
-"""Five times the asymmetry of Planck's maps (Planck 2018 results VII, A&A 641, A7). The response to a modulation is
-measured in skies like the observed one, which hold it already: the amplitude is wrong by about its own square."""
+"""Five times the asymmetry of Planck's maps (Planck 2018 results VII, A&A 641, A7)."""
 
-_STRONG = (
-    "a prior of this library: five times the asymmetry of Planck's maps, beyond which fits are too far from linear"
-)
+_STRONG = "a prior of this library: five times the asymmetry of Planck's maps"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ def test_effects_are_asked_for_at_once_and_then_known(monkeypatch: pytest.Monkey
 
     def jobs(own: Any, found: Any, constrained: bool, skies: int, first: int = 0, there: Any = ()) -> list[Any]:
         name = "".join(effect.name for effect in found)
-        return [SimpleNamespace(simulated=name, first=first, count=skies - first, observed=None, source=None)]
+        return [SimpleNamespace(simulated=name, first=first, count=skies - first, given=b"", source=None)]
 
     def ask(wanted: Any) -> list[np.ndarray]:
         asked.append([job.simulated for job in wanted])
@@ -32,7 +32,7 @@ def test_effects_are_asked_for_at_once_and_then_known(monkeypatch: pytest.Monkey
     asked: list[list[str]] = []
     monkeypatch.setattr(SameSkies, "_jobs", jobs)
     monkeypatch.setattr(SameSkies, "skies_of", lambda *_: "constrained")
-    monkeypatch.setattr(SameSkies, "seen", lambda *_: ((), (), ""))
+    monkeypatch.setattr(SameSkies, "seen", lambda *_: ((), (), (), "", ""))
     monkeypatch.setattr("mcsim.datavector.same_skies.replace", lambda job, **_: job)
     skies = SameSkies(None, ask, ())  # type: ignore[arg-type]
     effects = [config.Effect(name=name) for name in ("a", "bb")]
@@ -70,6 +70,27 @@ def test_the_sky_of_maps_with_a_gain_is_found_without_it() -> None:
         np.testing.assert_array_equal(skies.observed_with([wider]), skies.observed)
         small = [config.Effect(name="calibration", channel="V1", parameters={"amplitude": 1e-3})]
         np.testing.assert_array_equal(skies.observed_with(small), skies.observed)
+
+
+@pytest.mark.parametrize("frame", ["ecliptic", "galactic"])
+def test_the_sky_of_modulated_maps_is_found_without_the_modulation(frame: str) -> None:
+    """Both modulations act in the frame of the maps, which preparation turns into another one."""
+    table = two_channels("modulated", sigma0_uk=1.0)
+    if frame != "ecliptic":
+        table["preparation"] = [{"kind": "rotate", "frame": frame}]
+    run = config.load(table)
+    analysis = analysis_of(run, without=tuple(name for name in systematics.catalogue() if "modulation" not in name))
+    plain = SameSkies(analysis, lambda _: [], list(simulate.maps(survey(run), 0))).observed
+    for name, given in (
+        ("dipole_modulation", {"lon_deg": 30.0, "lat_deg": 40.0}),
+        ("quadrupole_modulation", {"components": (0.0, 1.0, 0.0, 0.0, 0.5)}),
+    ):
+        found, slight = (config.Effect(name=name, parameters={"amplitude": a, **given}) for a in (0.3, 0.005))
+        skies = SameSkies(analysis, lambda _: [], list(simulate.maps(survey(with_effects(run, [found])), 0)))
+        without, off = (np.linalg.norm(one - plain) for one in (skies.observed_with([found]), skies.observed))
+        assert off > 0.1 * np.linalg.norm(plain)
+        assert without < 0.15 * off
+        np.testing.assert_array_equal(skies.observed_with([slight]), skies.observed)
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -117,7 +138,7 @@ def test_the_sky_of_maps_with_an_ellipse_is_found_through_it() -> None:
         off, left = (np.linalg.norm(one - expected) for one in (circular, skies.observed_with(ellipse)))
         assert left < 0.3 * off
     slight = [config.Effect(name="beam_ellipticity", channel="W1", parameters={"amplitude": 0.02})]
-    assert skies.seen(slight) == ((), (), (), "")
+    assert skies.seen(slight) == ((), (), (), "", "")
 
 
 ADDED = [
@@ -144,7 +165,7 @@ def test_the_sky_of_maps_with_added_signals_is_found_without_them(
     assert off > 0.2 * np.linalg.norm(expected)
     step = analysis.candidates[0].basis[0].amplitude
     small = [config.Effect(name=name, channel=channel, parameters={**parameters, "amplitude": step})]
-    assert skies.seen(small) == ((), (), (), "")
+    assert skies.seen(small) == ((), (), (), "", "")
 
 
 def test_the_dipole_that_a_gain_leaves_in_the_only_channel_is_a_residual_one() -> None:
