@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from mcsim.config import load as load_config
     from mcsim.datavector.settings import DiagnosisSettings
     from mcsim.diagnosis.api import diagnose
-    from mcsim.diagnosis.external import ExternalModel
+    from mcsim.ensemble.external import ExternalModel
     from mcsim.ensemble.maps import write_maps
     from mcsim.ensemble.opening import open_ensemble, open_summary
     from mcsim.ensemble.prediction import predict
@@ -74,7 +74,7 @@ _HOME = {
     "Beam": "mcsim.instrument.beams",
     "DiagnosisSettings": "mcsim.datavector.settings",
     "Effect": "mcsim.systematics",
-    "ExternalModel": "mcsim.diagnosis.external",
+    "ExternalModel": "mcsim.ensemble.external",
     "InputError": "mcsim.errors",
     "LimitSettings": "mcsim.information.settings",
     "Moments": "mcsim.instrument.scan",

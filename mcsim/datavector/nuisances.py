@@ -4,7 +4,7 @@ The simulations of the model draw the nuisances, so that mean and covariance con
 them. The drawn coordinates are known: their regression on the data vectors is the posterior.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,31 @@ from mcsim.support.arrays import Matrix, Vector, divided
 
 MEASURED = 0.04
 """Share of the prior variance that the data leave at most of a nuisance whose response is that of the regression."""
+
+LEAST = 0.1  #: share of the prior variance that the data have to remove for a pull to be given
+
+
+@dataclass(frozen=True)
+class NuisanceResult:
+    """One linear component of a nuisance: its prior, and what the data make of it."""
+
+    #: name, channel, component, parameters, unit, label: of the effect; ``channel`` None: all; ``component`` counts
+    #: from 1, None for an effect of one
+    name: str
+    channel: str | None
+    component: int | None
+    parameters: dict[str, float | str | tuple[float, ...]]
+    unit: str
+    label: str
+    #: prior_mean, prior_width, amplitude, sigma: mean and standard deviation before and after the data
+    prior_mean: float
+    prior_width: float
+    amplitude: float
+    sigma: float
+    #: shift of the mean over the standard deviation that it has if the prior is right; None if the data do not
+    #: constrain the component
+    pull: float | None
+    words: str  #: posterior and prior as people read them
 
 
 @dataclass(frozen=True)
@@ -70,6 +95,29 @@ class Regression:
         scale = 1.0 + 1.0 / null.n_sims + self.shrinkage * float(white @ white) / null.dof
         shift = self.shrinkage * (self.slopes @ white + self.chance - prior_mean)
         return prior_mean + shift, np.sqrt(self.left * scale * degrees / (degrees - 2))
+
+    def results(self, nuisances: Sequence[Nuisance], x: Vector) -> Iterator[NuisanceResult]:
+        """Yield the components of nuisances with their posterior for data, shape (p_raw,)."""
+        found = self.posterior(x, np.concatenate([one.mean for one in nuisances]))
+        each = [(one, place) for one in nuisances for place in range(len(one.widths))]
+        for (one, place), amplitude, sigma in zip(each, *(values.tolist() for values in found), strict=True):
+            mean, width = float(one.mean[place]), float(one.sigma[place])
+            gained, before = width**2 - sigma**2, one.effect.format_amplitude(mean, width)
+            component = place + 1 if len(one.widths) > 1 else None
+            yield NuisanceResult(
+                name=one.effect.name,
+                channel=one.channel,
+                component=component,
+                parameters={**one.settings, **{f"{key}_width": value for key, value in one.parameter_widths.items()}},
+                unit=one.effect.unit,
+                label=one.title + (f", component {component}" if component else ""),
+                prior_mean=mean,
+                prior_width=width,
+                amplitude=amplitude,
+                sigma=sigma,
+                pull=(amplitude - mean) / float(np.sqrt(gained)) if gained > LEAST * width**2 else None,
+                words=f"{one.effect.format_amplitude(amplitude, sigma)} (prior {before})",
+            )
 
 
 def with_nuisances(

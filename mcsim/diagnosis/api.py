@@ -24,12 +24,13 @@ from mcsim.datavector.seeds import Checked
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.spectra_table import read_spectra
 from mcsim.diagnosis import controls, report, unlisted, words
+from mcsim.diagnosis.agreement import agreement
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
-from mcsim.diagnosis.external import ExternalModel, agreement, loaded
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.measured_spectra import MeasuredSpectra
 from mcsim.diagnosis.observed_maps import ObservedMaps
-from mcsim.diagnosis.result import Agreement, DiagnosisResult
+from mcsim.diagnosis.result import DiagnosisResult
+from mcsim.ensemble.external import ExternalModel, loaded
 from mcsim.ensemble.external_maps import Source
 from mcsim.ensemble.runner import Workers, load_ahead
 from mcsim.errors import InputError
@@ -106,7 +107,7 @@ def diagnose(
     check_asked(analysis, asked)
     task: Callable[[Job], NDArray[np.float64]] = data_vectors if table is None else table
     maps = checked_maps(analysis.model, given) if given else []
-    means = bool(given) and isinstance(data, str | Path) and of_pixel_means(analysis.model, data)
+    means = source is None and bool(given) and isinstance(data, str | Path) and of_pixel_means(analysis.model, data)
     key = _key(run, analysis)
     with batch(processes) as call:
         whole = task if source is None else Checked(task)
@@ -129,7 +130,10 @@ def diagnose(
     if means:
         diagnosis = replace(diagnosis, notes=(words.PIXEL_MEANS, *diagnosis.notes))
     if source is not None:
-        diagnosis = _with_agreement(diagnosis, agreement(known))
+        told = agreement(known)
+        said = (words.agreement(told),)
+        notes, warnings = ((*said, *diagnosis.notes), ()) if told.agrees else (diagnosis.notes, said)
+        diagnosis = replace(diagnosis, agreement=told, notes=notes, warnings=warnings)
     elif table is None:
         diagnosis = replace(diagnosis, warnings=_warnings(analysis))
     if drawn is not None:
@@ -180,7 +184,7 @@ def describe(
         head += f"; and at most {given} of {source.label}{stored}, whose own cost is not in what follows"
     priors = [f"nuisance: {line}" for one in analysis.nuisances for line in one.lines]
     lines, held = [head, *priors, *cost.lines(analysis, planned)], kept(run, analysis)
-    if folders.is_cached(_place(_key(run, analysis))):
+    if folders.is_cached(f"diagnose/{_key(run, analysis)}.zarr"):
         lines.append("  cache   has what these simulations tell: none of them is left to do")
     elif done := sum(len(held.found(job)) for job in jobs):
         lines.append(f"  cache   has {done} of these simulations")
@@ -212,7 +216,8 @@ def _analysed(
     for data that cannot be read.
     """
     threads = os.cpu_count() or 1
-    table = read_spectra(data, run) if isinstance(data, str | Path) and Path(data).is_file() else None
+    data = folders.user_path(data) if isinstance(data, str | Path) else data
+    table = read_spectra(data, run) if isinstance(data, Path) and data.is_file() else None
     given = {} if data is None or table is not None else given_maps(run, data)
     controls.check(wanted, of_maps=table is None, external=source is not None)
     if table is not None:
@@ -231,15 +236,6 @@ def _analysed(
         )
     power.check(analysis.model.survey)
     return run, analysis, table, given
-
-
-def _with_agreement(diagnosis: DiagnosisResult, found: Agreement) -> DiagnosisResult:
-    """Return a result that says if mcsim's own simulation agrees with the external one, first if it does not."""
-    sentence = words.agreement(found)
-    kept = replace(diagnosis, agreement=found)
-    if not found.agrees:
-        return replace(kept, warnings=(sentence,))
-    return replace(kept, notes=(sentence, *kept.notes))
 
 
 def _warnings(analysis: Analysis) -> tuple[str, ...]:
@@ -270,15 +266,10 @@ def _learned(
     def fill(scratch: Path) -> None:
         null_ensemble.save(scratch, *campaign.learned(analysis, ask, simulations))
 
-    found = null_ensemble.load(folders.cached(_place(key), fill))
+    found = null_ensemble.load(folders.cached(f"diagnose/{key}.zarr", fill))
     if analysis.settings.sims_per_element >= DiagnosisSettings().sims_per_element:
         shutil.rmtree(kept(run, analysis).folder, ignore_errors=True)
     return found
-
-
-def _place(key: str) -> str:
-    """Return where the cache has a model that is learned."""
-    return f"diagnose/{key}.zarr"
 
 
 def _key(run: config.RunConfig, analysis: Analysis, settings: DiagnosisSettings | None = None) -> str:

@@ -7,15 +7,14 @@ import numpy as np
 
 from mcsim import config
 from mcsim.datavector.candidate import Candidate, columns_of, parts_of, scatters_of
-from mcsim.datavector.nuisances import Regression, with_priors
+from mcsim.datavector.nuisances import NuisanceResult, Regression, with_priors
 from mcsim.diagnosis.consistency import amplitudes
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
-from mcsim.diagnosis.nuisance_result import NuisanceResult, results
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import CandidateResult, DiagnosisResult, EffectResult, EffectSet
 from mcsim.diagnosis.selection import Explanation
 from mcsim.errors import InputError
-from mcsim.stats.detection import detectable, snr_needed, snr_to_separate
+from mcsim.stats.detection import cosines, detectable, snr_needed, snr_to_separate
 from mcsim.stats.excess import HeldOut, excess_of
 from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Matrix, Vector
@@ -30,6 +29,7 @@ def result_of(
     context, found, partial = data.context, refined.attribution, refined.partial
     ensemble, null, model, tested = context.ensemble, context.null, context.analysis.model, context.of_model
     residuals = data.residual_maps()
+    correlation = cosines(tested.null.whiten_groups(refined.straight, [one.columns for one in context.candidates]))
     return DiagnosisResult(
         case=case,
         kind=found.verdict,
@@ -49,27 +49,29 @@ def result_of(
         held_out=reduction,
         nuisances=tuple(_nuisances(data, refined)),
         places=tuple(data.places()),
-        candidates=tuple(_candidates(data, refined)),
+        candidates=tuple(_candidates(data, refined, correlation)),
         elements=context.analysis.elements,
         maps=tuple(part.name for part in model.parts),
         data=data.x,
         mean=null.mean,
         standard_deviation=tested.ensemble.simulations.std(axis=0, ddof=1),
         templates=refined.templates,
-        correlation=found.correlation,
+        correlation=correlation,
         held_out_pvalues=tested.ensemble.held_out_pvalues(tested.null),
         calibration=tested.calibration.combined,
         residual_maps=residuals,
         residual_range=None if residuals is None else np.quantile(ensemble.residual_rms, [0.025, 0.975], axis=0).T,
         frame=model.frame,
         notes=tuple(notes),
-        untested=tuple(_untested(context)),
+        untested=()
+        if ensemble.nuisances is None
+        else tuple(one.words for one, ok in zip(ensemble.elements, ensemble.tested, strict=True) if not ok),
         settings=context.settings,
         provenance={
             "simulations of the model": len(ensemble.simulations),
             "skies constrained by the data": context.settings.constrained_skies,
             "seed of the run": context.run.ensemble.seed,
-            **({"worth": null.dof + 1} if null.covariance_dof is not None else {}),
+            **({"worth": tested.null.dof + 1} if tested.null.covariance_dof is not None else {}),
             **data.provenance(),
         },
         configuration=config.to_json(context.run),
@@ -115,14 +117,8 @@ def _nuisances(data: DataSet, refined: Refined) -> Iterator[NuisanceResult]:
     if partial is not None and not members:
         members, t = partial.members, partial.templates
     null = context.null.with_extra_covariance(*scatters_of(refined.candidates, members))
-    found_of = Regression.of(context.ensemble, null, t[:, columns_of(refined.candidates, members)])
-    yield from results(context.analysis.nuisances, found_of, data.x)
-
-
-def _untested(context: DiagnosisContext) -> Iterator[str]:
-    """Yield the elements that are not tested, in words."""
-    if (ensemble := context.ensemble).nuisances is not None:
-        yield from (one.words for one, kept in zip(ensemble.elements, ensemble.tested, strict=True) if not kept)
+    known = Regression.of(context.ensemble, null, t[:, columns_of(refined.candidates, members)])
+    yield from known.results(context.analysis.nuisances, data.x)
 
 
 def effects_of(candidates: Sequence[Candidate], members: Sequence[int], fit: Fit) -> Iterator[EffectResult]:
@@ -168,12 +164,12 @@ def _sigma(candidate: Candidate, theta: Vector, covariance: Vector, parameter: s
     unit = how.coordinates(replace(inside, amplitude=1.0))
     if parameter == "amplitude" and not how.nonlinear and (known := float(unit @ precision @ unit)) > 0.0:
         free = candidate.with_coordinates(constrained, precision)
-        longer = _longer(candidate, constrained, covariance) if inside == free else 0.0
+        longer = _longer(candidate, constrained, covariance, precision) if inside == free else 0.0
         variance = max(variance * (inside == free), 1.0 / known, longer**2)
     return float(np.sqrt(variance))
 
 
-def _longer(candidate: Candidate, theta: Vector, covariance: Matrix) -> float:
+def _longer(candidate: Candidate, theta: Vector, covariance: Matrix, precision: Matrix) -> float:
     """Return by how much the amplitude grows on average when coordinates move by their errors, either way.
 
     0 if some coordinates are not constrained: these are not varied.
@@ -181,7 +177,6 @@ def _longer(candidate: Candidate, theta: Vector, covariance: Matrix) -> float:
     if np.count_nonzero(theta) < len(theta):
         return 0.0
     errors, axes = np.linalg.eigh(covariance)
-    precision = np.asarray(np.linalg.pinv(covariance), dtype=np.float64)
     here, more = abs(candidate.with_coordinates(theta, precision).amplitude), 0.0
     for step in (axes * np.sqrt(np.maximum(errors, 0.0))).T:
         there = (abs(candidate.with_coordinates(one, precision).amplitude) for one in (theta + step, theta - step))
@@ -189,12 +184,15 @@ def _longer(candidate: Candidate, theta: Vector, covariance: Matrix) -> float:
     return max(more, 0.0)
 
 
-def _candidates(data: DataSet, refined: Refined) -> Iterator[CandidateResult]:
-    """Yield every candidate with its fit alone, what would be detected, and what is most like it."""
-    null, t, found, candidates = data.context.null, refined.templates, refined.attribution, data.context.candidates
-    responds = np.any(t != 0.0, axis=0)
-    rank = np.array([int(responds[list(one.columns)].sum()) for one in candidates])
-    pvalues = null.nested_test(np.array([s.delta_chi2 for s in found.singles]), null.chi2(data.x), rank)
+def _candidates(data: DataSet, refined: Refined, correlation: Matrix) -> Iterator[CandidateResult]:
+    """Yield every candidate with its fit alone, what would be detected, and what is most like it.
+
+    The last two follow from straight responses and the model's noise, whatever was found: ``correlation`` has shape
+    (C, C).
+    """
+    null, t, found, candidates = data.context.null, refined.templates, refined.attribution, refined.candidates
+    known, straight = data.context.of_model.null, refined.straight
+    rank = null.whiten_groups(t, [one.columns for one in candidates]).sizes
     for k, candidate in enumerate(candidates):
         columns = list(candidate.columns)
         try:
@@ -204,15 +202,15 @@ def _candidates(data: DataSet, refined: Refined) -> Iterator[CandidateResult]:
             amplitude, sigma, words = float("nan"), float("nan"), "no such amplitude"
         typical, fixed = candidate.typical, candidate.fixed
         at = "".join(f" at {name.replace('_', ' ')} {value:g}" for name, value in fixed.items())
-        reach, size = detectable(null, t[:, columns], len(candidates), typical), None
-        rows = min(max(int(rank[k]), 1), null.dimension)
-        needed = snr_needed(rows, len(candidates), null.dimension, null.dof + 1)
+        reach, size = detectable(known, straight[:, columns], len(candidates), typical), None
+        responds = max(int(np.any(straight[:, columns] != 0.0, axis=0).sum()), 1)
+        needed = snr_needed(min(responds, known.dimension), len(candidates), known.dimension, known.dof + 1)
         if np.isfinite(reach):
             size = abs(candidate.with_coordinates(reach * typical[:, 0], np.eye(len(columns))).amplitude)
         # Candidates that differ in settings only are variants of one effect.
         others = [j for j, other in enumerate(candidates) if other.identity != candidate.identity]
-        similar = max(others, key=lambda j: abs(found.correlation[k, j]), default=None)
-        cosine = 0.0 if similar is None else abs(float(found.correlation[k, similar]))
+        similar = max(others, key=lambda j: abs(correlation[k, j]), default=None)
+        cosine = 0.0 if similar is None else abs(float(correlation[k, similar]))
         strength = 0.0 if similar is None else float(snr_to_separate(cosine))
         separable = float("nan") if size is None or similar is None else strength * size / needed
         yield CandidateResult(
@@ -226,7 +224,7 @@ def _candidates(data: DataSet, refined: Refined) -> Iterator[CandidateResult]:
             sigma=sigma,
             words=words,
             delta_chi2=null.hartlap_factor * float(found.singles[k].delta_chi2),
-            pvalue=min(1.0, float(pvalues[k]) * int((rank > 0).sum())),
+            pvalue=min(1.0, found.singles[k].nested_pvalue * int((rank > 0).sum())),
             detectable=size,
             detectable_words=_in_words(candidate, size, at),
             fixed=fixed,

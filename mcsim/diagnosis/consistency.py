@@ -193,13 +193,6 @@ class Slices:
         checks = (self._left(channel, actions, free) for channel in ([] if noisy else seen))
         return Findings(tuple(comparisons), tuple(check for check in checks if check is not None))
 
-    def _own(self, channel: str | None) -> list[tuple[int, Element]]:
-        """Return the elements of a channel, or of all, that are no matched filters."""
-        found = enumerate(self.ensemble.elements)
-        return [
-            (row, e) for row, e in found if e.statistic != "score" and (channel is None or set(e.channels) == {channel})
-        ]
-
     def _folds(self, own: Sequence[tuple[int, Element]], response: Vector) -> tuple[str, str]:
         """Return what the folds are in words, of the kind of elements in which a response shows most."""
         sizes: dict[str, float] = {}
@@ -209,7 +202,9 @@ class Slices:
         return FOLDS.get(max(sizes, key=lambda kind: sizes[kind], default=""), self.folds)
 
     def _divisions(self, candidate: Candidate, response: Vector) -> Iterator[Division]:
-        own, first = self._own(candidate.channel), len(self.z) - self.beside
+        each = [(row, e) for row, e in enumerate(self.ensemble.elements) if e.statistic != "score"]
+        own = [(row, e) for row, e in each if candidate.channel is None or set(e.channels) == {candidate.channel}]
+        first = len(self.z) - self.beside
         halves = [[row for row, e in own if e.fold == fold] for fold in (0, 1)]
         yield _of_rows("halves", self._folds(own, response), halves)
         noisy = acts_through(candidate.effect, "noise")  # it shows in differences of splits, and in pixels
@@ -383,12 +378,7 @@ def contradiction(findings: Findings, candidates: Sequence[Candidate], effects: 
 
 def amplitudes(one: Comparison, effect: Effect) -> str:
     """Return the amplitudes of a comparison in words, in the unit of the effect at its fitted amplitude."""
-    parts = zip(one.slices, one.amplitudes, one.errors, strict=True)
-    words = [f"{_strength(effect, a, sigma)} in {where}" for where, a, sigma in parts]
-    if one.kind == "map":
-        words.append(f"{_strength(effect, 1.0, 0.0)} in all of the data")
+    parts, size = zip(one.slices, one.amplitudes, one.errors, strict=True), effect.amplitude
+    words = [f"{effect.format_amplitude(a * size, sigma * abs(size))} in {where}" for where, a, sigma in parts]
+    words += [f"{effect.format_amplitude(size)} in all of the data"] * (one.kind == "map")
     return " and ".join(words)
-
-
-def _strength(effect: Effect, factor: float, error: float) -> str:
-    return effect.format_amplitude(factor * effect.amplitude, error * abs(effect.amplitude))

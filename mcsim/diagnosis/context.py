@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Generic, TypeVar
@@ -18,10 +17,10 @@ from mcsim.datavector.nuisances import with_nuisances
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.selection import Attribution
-from mcsim.errors import InputError
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
 from mcsim.support.arrays import Matrix, Vector
+from mcsim.systematics import if_possible
 
 Data = TypeVar("Data")
 
@@ -67,12 +66,8 @@ class DiagnosisContext:
         mean = self.null.mean - self.ensemble.offset
         return replace(self, ensemble=self.ensemble.without_offset, null=self.null.shift(mean))
 
-    def reference(self, found: Sequence[config.Effect]) -> Matrix:
-        """Return the data vectors of the skies in which responses to effects are measured, shape (skies, p)."""
-        return self.extended_reference(found)[:, : len(self.ensemble.elements)]
-
     def extended_reference(self, found: Sequence[config.Effect]) -> Matrix:
-        """Return those of :meth:`reference` with the numbers beside the data vector behind it, (skies, p + E)."""
+        """Return data vectors, and the numbers beside them, of the skies with which responses are measured."""
         if any(map(self.knows, found)):
             return self.of_model.extended_reference(found)
         if self.analysis.source_of(found) is None:
@@ -137,15 +132,15 @@ class DataSet(ABC, Generic[Data]):
 
     def respond(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return changes of the data vector by effects, (rows, p), in ``skies`` skies or those of the reference."""
-        before, after = self.pair_extended(found, skies)
-        return after - before
+        return self.respond_extended(found, skies)[:, : len(self.x)]
 
     def pair_extended(self, found: Sequence[config.Effect], skies: int) -> tuple[Matrix, Matrix]:
         """Return :attr:`extended` of skies without and with effects that are simulated in the same ones, (rows, p + E).
 
         They are ``skies`` skies, or those of the reference.
         """
-        return self.context.reference(found), np.concatenate(self.ask(after_jobs(self.context.analysis, found)))
+        after = self.ask(after_jobs(self.context.analysis, found))
+        return self.context.extended_reference(found), np.concatenate(after)
 
     @property
     def extended(self) -> Vector:
@@ -154,12 +149,13 @@ class DataSet(ABC, Generic[Data]):
 
     def respond_extended(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return the changes of :meth:`respond` for :attr:`extended`."""
-        return self.respond(found, skies)
+        before, after = self.pair_extended(found, skies)
+        return after - before
 
     def responses(self, candidates: Sequence[Candidate], skies: int) -> Iterator[tuple[Candidate, Matrix]]:
         """Yield those that can be simulated with their responses to small effects over coordinates, (p + E, K)."""
         for one in candidates:
-            with suppress(InputError):
+            with if_possible():
                 tables = [one.table(effect) for effect in one.basis]
                 changes = [self.respond_extended([table], skies).mean(axis=0) for table in tables]
                 yield one, np.stack(changes, axis=1) / one.steps

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from mcsim import config
+from mcsim.datavector.bent import bent_templates
 from mcsim.datavector.campaign import after_jobs, null_jobs
 from mcsim.datavector.candidate import columns_of, parts_of
-from mcsim.diagnosis.bent import bent_templates
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
 from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.errors import InputError
@@ -42,7 +42,7 @@ def with_found_noise(data: DataSet[Any], refined: Refined) -> tuple[DataSet[Any]
             pair = data.pair(list(noise.values())) if noise else None
         except InputError:
             break
-        if pair is None or _moved(data.context.null, data.context.reference(()), pair[1]) < STRONG:
+        if pair is None or _moved(data.context.null, data.context.ensemble.reference, pair[1]) < STRONG:
             break
         data = replace(data, context=_scattered(data, model, tuple(noise.values())))
         own, t = data.context, data.templates()

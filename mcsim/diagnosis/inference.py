@@ -10,11 +10,11 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from mcsim import config
+from mcsim.datavector.bent import bent_templates
 from mcsim.datavector.candidate import columns_of, parts_of, scatters_of, tables_at, tables_beside
 from mcsim.datavector.halves import Halves
 from mcsim.datavector.nuisances import with_priors
 from mcsim.diagnosis.assemble import result_of
-from mcsim.diagnosis.bent import bent_templates
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import as_seen
 from mcsim.diagnosis.found_noise import in_words, with_found_noise
@@ -57,8 +57,9 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
         if why := unconfirmed(context, found, reduction is not None):
             refusals.append(why)
             found, reduction = found.unexplained(), None
-    # What the rest of the data contradicts is not detected in it.
-    if detected is None and not (exchanged or refusals) and not found.faint and found.verdict == "unknown":
+    # What the rest of the data contradicts is not detected in it; after an unknown gap it was looked for already.
+    searched = exchanged or refusals or found.faint or refined.attribution.verdict == "unknown"
+    if found.verdict == "unknown" and not searched:
         detected = PartialSearch(data).run(refined.templates, refined.candidates)
     notes += refusals
     for own in found.explanations[:1] if detected is None else [detected]:
@@ -199,7 +200,7 @@ def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:
     def respond(frozen: Fit) -> Vector:
         acting = acting_at(frozen)
         change: Vector = matrix @ data.respond(acting, context.settings.constrained_skies).mean(axis=0)
-        if not scatters and halves.exceeds(change, t @ frozen.amplitudes, context.settings.reduction_sigma):
+        if not scatters and halves.exceeds(change, t @ free @ frozen.amplitudes, context.settings.reduction_sigma):
             raise InputError("the response is far from straight between the amplitudes of all data and of a half.")
         return change
 

@@ -30,12 +30,12 @@ def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[
     refused: list[Explanation] = []
     doubted: list[tuple[Explanation, str]] = []
     sentences: list[str] = []
-    for place, one in enumerate(found.explanations):
+    for one in found.explanations:
         members, why = [candidates[member] for member in one.members], ""
         if any(is_drawn(candidate) for candidate in members):
             if len(frequencies) == 1:
                 why = "at a single frequency it looks like any signal that is fixed to the sky"
-        elif place < settings.compared_sets:
+        elif len(kept) < settings.compared_sets:
             one = replace(one, findings=slices.findings(members, list(_actions(data, refined, one))))
             if one.findings.contradict(settings):
                 effects = [candidates[k].fitted(*part) for k, *part in parts_of(candidates, one.members, one.fit)]

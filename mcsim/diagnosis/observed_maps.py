@@ -1,7 +1,6 @@
 """Observed maps: read them, refuse what the model cannot describe, and prepare them for a diagnosis."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -17,8 +16,8 @@ from mcsim.datavector.nuisances import half_given_other
 from mcsim.datavector.same_skies import SameSkies, Skies
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.selection import Attribution
-from mcsim.errors import InputError
 from mcsim.support.arrays import Map, Matrix, Vector
+from mcsim.systematics import if_possible
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +51,6 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         """Return what simulates responses."""
         return SameSkies(self.context.analysis, self.ask, self.data, self.context.noise)
 
-    def respond(self, found: Sequence[config.Effect], skies: int) -> Matrix:
-        """Return changes of the data vector in ``skies`` skies, shape (rows, p)."""
-        return self.respond_extended(found, skies)[:, : len(self.x)]
-
     def respond_extended(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return the changes of :meth:`respond` with those of the numbers beside the data vector, (rows, p + E)."""
         kinds: dict[Skies, list[config.Effect]] = {}
@@ -88,7 +83,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
 
     def responses(self, candidates: Sequence[Candidate], skies: int) -> Iterator[tuple[Candidate, Matrix]]:
         """Yield candidates with their responses, all of which are simulated at once if all can be."""
-        with suppress(InputError):
+        with if_possible():
             self.same_skies.ahead([one.table(effect) for one in candidates for effect in one.basis], skies)
         yield from super().responses(candidates, skies)
 
@@ -146,10 +141,12 @@ class ObservedMaps(DataSet[Sequence[Map]]):
     def _odd_responses(self, candidates: Sequence[Candidate], skies: int) -> Iterator[tuple[Candidate, Matrix]]:
         """Yield candidates with what of their responses has the sign of the observed sky, shape (p + E, K)."""
         tables = [[one.table(effect) for effect in one.basis] for one in candidates]
-        self.same_skies.ahead([*chain(*tables)], skies, odd=True)
+        with if_possible():
+            self.same_skies.ahead([*chain(*tables)], skies, odd=True)
         for one, each in zip(candidates, tables, strict=True):
-            changes = [self.same_skies.odd([table], skies).mean(axis=0) for table in each]
-            yield one, np.stack(changes, axis=1) / one.steps
+            with if_possible():
+                changes = [self.same_skies.odd([table], skies).mean(axis=0) for table in each]
+                yield one, np.stack(changes, axis=1) / one.steps
 
     def exchanged(self, found: Attribution) -> list[str]:
         """Return orders of maps or pixels in which the model fits, unless it fits as they are or one effect does."""

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from mcsim.datavector.bent import beyond
 from mcsim.datavector.candidate import Candidate, columns_of, coordinates_of, effects_at, lost, scatters_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.selection import Selection
 from mcsim.errors import InputError
-from mcsim.stats.gaussian import Fit, SimulatedGaussian
+from mcsim.stats.gaussian import Fit
 from mcsim.stats.scattered import with_drawn_scatter
 from mcsim.support.arrays import Matrix, Vector
 
@@ -94,40 +95,25 @@ class PartialSearch:
         Strong effects change their own responses and each other's. None if one can have no such amplitude, or the
         amplitudes diverge round by round.
         """
-        columns, share = np.array(columns_of(candidates, members)), self.context.settings.settled_share
+        columns, settings = np.array(columns_of(candidates, members)), self.context.settings
         fitted = self.context.null.fit(self.data.x, t[:, columns])
-        for _ in range(self.context.settings.joint_rounds):
+        for _ in range(settings.joint_rounds):
             try:
                 effects = effects_at(candidates, members, fitted)
                 tables = [candidates[member].table(effect) for member, effect in zip(members, effects, strict=True)]
                 stochastic = any(effect.parametrization.stochastic for effect in effects)
-                response = self.data.respond(tables, number_of_skies(self.context.settings, stochastic)).mean(axis=0)
+                skies = settings.scatter_skies if stochastic else settings.constrained_skies
+                response = self.data.respond(tables, skies).mean(axis=0)
             except InputError:
                 return None
             t = t.copy()
             at = coordinates_of(candidates, members, effects)
             t[:, columns] += beyond(self.context.null, t[:, columns], at, response)
             before, fitted = fitted, self.context.null.fit(self.data.x, t[:, columns])
-            if has_settled(self.context.settings, before.amplitudes, fitted.amplitudes, fitted.covariance, share):
+            moved = before.amplitudes, fitted.amplitudes, fitted.covariance
+            if has_settled(settings, *moved, settings.settled_share):
                 return t
         return None
-
-
-def number_of_skies(settings: DiagnosisSettings, stochastic: bool) -> int:
-    """Return how many constrained skies the response to effects is averaged over."""
-    return settings.scatter_skies if stochastic else settings.constrained_skies
-
-
-def beyond(null: SimulatedGaussian, t: Matrix, at: Vector, response: Vector) -> Matrix:
-    """Return what makes templates, shape (p, k), exact at coordinates: the response beyond their sum.
-
-    It is shared in proportion to the squared white norms of the parts, so that a weakly constrained one, whatever
-    its fitted coordinate, does not change.
-    """
-    parts = t * at
-    weights = np.sum(null.whiten_templates(parts) ** 2, axis=0)
-    shares = np.divide(weights, at * weights.sum(), out=np.zeros_like(at), where=weights > 0.0)
-    return np.outer(response - parts.sum(axis=1), shares)
 
 
 def has_settled(

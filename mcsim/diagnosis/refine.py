@@ -6,15 +6,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy import special
 
+from mcsim.datavector.bent import beyond
 from mcsim.datavector.candidate import Candidate, columns_of, parts_of, scatters_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
-from mcsim.diagnosis.partial import PartialExplanation, PartialSearch, beyond, has_settled, number_of_skies
+from mcsim.diagnosis.partial import PartialExplanation, PartialSearch, has_settled
 from mcsim.diagnosis.selection import Attribution, Explanation, Selection, attributed
 from mcsim.errors import InputError
 from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit
 from mcsim.stats.scattered import Acting
 from mcsim.support.arrays import Matrix, Vector
+from mcsim.systematics import if_possible
 
 ALIKE = 0.7  #: cosine of linear responses from which on one candidate can pass for another
 STEEPEST = 9.0  #: a response is never taken to grow with more than the tenth power of its amplitude
@@ -23,6 +25,7 @@ WIDE = 8.0
 it makes of noise and of the part of the sky that is not known, and what is like it makes otherwise, is no small part of
 the difference of the two then."""
 
+MOVED = 0.1  #: share of coordinates by which they move from which on what they scatter is drawn anew
 NEARLY = 0.8  #: share of what the best single candidate explains, from which on others are tried that explain less
 
 
@@ -31,12 +34,14 @@ class Refined:
     """Hold an attribution with responses at the amplitudes that it names.
 
     The ``templates``, shape (p, K), and the ``candidates``, with the scatter of stochastic ones, are those at the
-    amplitudes that were simulated; ``partial`` is what is detected if no set of candidates is accepted.
+    amplitudes that were simulated; the ``straight`` ones are of small amplitudes. ``partial`` is what is detected if no
+    set of candidates is accepted.
     """
 
     attribution: Attribution
     templates: Matrix
     candidates: tuple[Candidate, ...]
+    straight: Matrix
     partial: PartialExplanation | None = None
 
 
@@ -127,7 +132,7 @@ class Refiner:
         if found.gap.pvalue > self.context.settings.faint_pvalue:
             # Templates that were simulated at what noise looks like follow noise: the odds of a faint gap are theirs.
             found = replace(found, probability=min(found.probability, first.probability))
-        return Refined(found, now.t, tuple(now.candidates), detected)
+        return Refined(found, now.t, tuple(now.candidates), t, detected)
 
     def _of_sets(self, now: "_Responses", sets: Sequence[tuple[int, ...]]) -> Iterator[tuple[int, Vector, Matrix]]:
         """Yield the members of sets with their fitted coordinates."""
@@ -195,27 +200,22 @@ class Refiner:
                     found.setdefault(index, others)
         return [(others, index) for index, others in found.items()]
 
-    def _dipole_snr(self, candidate: Candidate, coordinates: Vector, covariance: Matrix) -> float:
-        """Return the S/N of the dipole that a candidate leaves in the only channel; 0 if it can have no such size."""
-        try:
-            return self.data.dipole_snr([candidate.table(candidate.detected(coordinates, covariance))])
-        except InputError:
-            return 0.0
-
     def _may_replace(self, now: "_Responses", one: Explanation, others: tuple[int, ...], index: int) -> bool:
         """Return True if an effect fits worse than a set beside others by no more than its bent response may cost it.
 
         A template that is wrong by b standard deviations raises chi^2 of the true effect by b^2 on average, with a
         scatter of 2 b. By how much the products of a dipole with the observed sky are wrong is not known.
         """
-        together = (*others, index)
+        together, candidate, settings = (*others, index), now.candidates[index], self.context.settings
         fit = self.context.null.fit(self.data.x, now.t[:, columns_of(now.candidates, together)])
         *_, (_, coordinates, covariance) = parts_of(now.candidates, together, fit)
-        if self._dipole_snr(now.candidates[index], coordinates, covariance) > self.context.settings.nonlinear_sigma:
-            return True
-        bend = self._bend(list(now.candidates[index].columns), coordinates)
-        allowed = (bend + 2.0) ** 2 + 2.0 * np.log(self.context.settings.odds_cut)
-        return bend > self.context.settings.nonlinear_sigma and fit.chi2 - one.fit.chi2 <= allowed
+        with if_possible():  # of no such size
+            there = candidate.table(candidate.detected(coordinates, covariance))
+            if self.data.dipole_snr([there]) > settings.nonlinear_sigma:
+                return True
+        bend = self._bend(list(candidate.columns), coordinates)
+        allowed = (bend + 2.0) ** 2 + 2.0 * np.log(settings.odds_cut)
+        return bend > settings.nonlinear_sigma and fit.chi2 - one.fit.chi2 <= allowed
 
     def _simulate_in_place(self, now: "_Responses", others: tuple[int, ...], index: int) -> bool:
         """Simulate a candidate beside others at its amplitude until that settles; return True if anything changed."""
@@ -241,8 +241,8 @@ class Refiner:
         within = candidate.nuisance and not self._is_beyond_prior(now.linear[:, columns], len(now.candidates))
         if within or self._has_been(now, index, coordinates, covariance):
             return False
-        nonlinear = curved or how.nonlinear or candidate.nuisance or self._is_nonlinear(columns, coordinates)
-        nonlinear = nonlinear or (done is not None and self._is_nonlinear(columns, done))
+        bends = (self._bend(columns, one) for one in (coordinates, done) if one is not None)
+        nonlinear = curved or how.nonlinear or candidate.nuisance or max(bends) > self.context.settings.nonlinear_sigma
         # From here on its template is what it does to this very sky, and its prior a part of its error.
         candidate = now.candidates[index] = replace(candidate, nuisance=False)
         stochastic = how.stochastic and (how.sign == 0 or coordinates[0] > 0.0)
@@ -269,7 +269,7 @@ class Refiner:
             acting = Acting.of(self.context.null, now.t, [one.columns for one in now.candidates], index, pair)
             if acting.own <= WIDE or how.noise_alone:
                 now.candidates[index] = replace(candidate, acting=acting, scatter=None)
-            elif candidate.scatter is None or done is None or _has_moved(done, at):
+            elif candidate.scatter is None or done is None or np.linalg.norm(at - done) > MOVED * np.linalg.norm(at):
                 drawn = self.data.respond([there], self.context.settings.scatter_skies)
                 now.candidates[index] = replace(candidate, acting=None, scatter=self.data.scatter(drawn))
         return True
@@ -334,19 +334,15 @@ class Refiner:
         None if the effect can have neither. A linear fit may lie somewhat beyond what the effect can be, and the effect
         be there; far beyond it is not. The data are None of a stochastic effect, and where there are none.
         """
+        settings = self.context.settings
+        skies = settings.scatter_skies if stochastic else settings.constrained_skies
         for factor in (1.0, 0.5):
-            try:
+            with if_possible():
                 effect = candidate.detected(factor * coordinates, factor**2 * covariance)
                 tables = [candidate.table(effect)]
                 pair = None if stochastic else self.data.pair(tables)
-                changes = (
-                    self.data.respond(tables, number_of_skies(self.context.settings, stochastic))
-                    if pair is None
-                    else pair[1] - pair[0]
-                )
+                changes = self.data.respond(tables, skies) if pair is None else pair[1] - pair[0]
                 return candidate.parametrization.coordinates(effect), changes, pair
-            except InputError:
-                continue
         return None
 
     def _to_try(self, found: Attribution, candidates: Sequence[Candidate]) -> list[tuple[int, Vector, Matrix]]:
@@ -399,10 +395,6 @@ class Refiner:
         fall = null.hartlap_factor * null.fit(self.data.x, t).delta_chi2
         return bool(candidates * special.chdtrc(t.shape[1], fall) <= self.context.settings.further_level)
 
-    def _is_nonlinear(self, columns: list[int], coordinates: Vector) -> bool:
-        """Return True if the second derivative matters at these coordinates."""
-        return self._bend(columns, coordinates) > self.context.settings.nonlinear_sigma
-
     def _bend(self, columns: list[int], coordinates: Vector) -> float:
         """Return by how many standard deviations a response departs from a straight line at these coordinates."""
         shift = self.context.bank.curvature[:, columns] @ coordinates**2
@@ -419,11 +411,6 @@ def _steepness(before: tuple[Vector, Vector], now: tuple[Vector, Vector], covari
     moved, fitted = now[0] - before[0], now[1] - before[1]
     size = float(moved @ precision @ moved)
     return float(np.clip(-(moved @ precision @ fitted) / size, 0.0, STEEPEST)) if size > 0.0 else 0.0
-
-
-def _has_moved(before: Vector, now: Vector) -> bool:
-    """Return True if coordinates have moved by more than a tenth, and so has what they scatter."""
-    return bool(np.linalg.norm(now - before) > 0.1 * np.linalg.norm(now))
 
 
 def _nearly_best(explained: Vector, ranked: Sequence[int], least: int) -> Sequence[int]:

@@ -12,15 +12,9 @@ from mcsim.diagnosis import figures, words
 from mcsim.diagnosis.result import PLACES, DiagnosisResult
 from mcsim.reconstruction.figure import structure_figure
 from mcsim.support import page as page_
-from mcsim.support.folders import write_whole
 from mcsim.support.numbers import measured, number, p_equals, probability
 
 DOTS_PER_INCH = 120
-
-
-def write(result: DiagnosisResult, path: str | Path) -> None:
-    """Write a diagnosis as one HTML file, in a folder that exists, that needs nothing else, not even a network."""
-    write_whole(Path(path), page(result))
 
 
 def page(result: DiagnosisResult) -> str:

@@ -11,11 +11,11 @@ import xarray as xr
 from pydantic import TypeAdapter
 
 from mcsim.datavector.localisation import Place
+from mcsim.datavector.nuisances import NuisanceResult
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element
 from mcsim.diagnosis.consistency import Comparison, MapCheck
 from mcsim.diagnosis.control_result import Controls
-from mcsim.diagnosis.nuisance_result import NuisanceResult
 from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.ensemble.store import write_dataset
 from mcsim.errors import InputError
@@ -23,7 +23,7 @@ from mcsim.reconstruction.result import HEAD, Reconstructed
 from mcsim.stats.excess import HeldOut, Measured, excess_of
 from mcsim.stats.look_elsewhere import GlobalTest
 from mcsim.support.arrays import Vector, texts
-from mcsim.support.folders import replacing, unreadable
+from mcsim.support.folders import replacing, unreadable, user_path
 
 VERDICT, REPORT, STORE = "verdict.json", "report.html", "diagnosis.zarr"
 PLACES = 12  #: groups in the localisation table of ``verdict.json`` and of the report
@@ -346,12 +346,14 @@ class DiagnosisResult:
         earlier diagnosis has written there is deleted, effects that this one does not use and a report included.
         ``verdict.json`` comes last: a process that is killed leaves a folder without it, with files of one diagnosis.
         """
-        target = Path(folder)
+        target = user_path(folder)
         written = {f"{one.name}.py": one.file for one in self.unlisted or () if one.file is not None}
         written |= {} if page is None else {REPORT: page}
         written[VERDICT] = json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n"
         used = {one.name for one in self.candidates}
-        used |= {Path(one["name"]).stem for one in json.loads(self.configuration).get("effect") or ()}
+        run = json.loads(self.configuration)
+        acting = [one["name"] for one in run.get("effect") or ()] + [one["effect"] for one in run.get("nuisance") or ()]
+        used |= {Path(name).stem for name in acting}
         earlier = [
             path.name
             for path in target.glob("unlisted_*.py")
@@ -371,7 +373,7 @@ class DiagnosisResult:
         InputError
             If the folder holds no diagnosis, or one that is not whole.
         """
-        path = Path(folder) / STORE
+        path = user_path(folder) / STORE
         if not path.is_dir():
             raise InputError(f"{path} does not exist; give the output folder of mcsim diagnose.")
         values: dict[str, Any] = dict.fromkeys(_ARRAYS)

@@ -13,7 +13,6 @@ from mcsim.datavector.candidate import Candidate, beyond, columns_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.consistency import NOT_TESTED, Findings
 from mcsim.diagnosis.subsets import EXHAUSTIVE, Subsets, chunks
-from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
 from mcsim.stats.scattered import Acting, Groups, variance_beside
@@ -74,7 +73,6 @@ class Attribution:
     nearest: int
     cosine: float
     singles: tuple[Fit, ...]  #: fit of each candidate alone
-    correlation: Matrix  #: largest canonical correlation of each pair of candidates, shape (C, C)
     contrasts: tuple[Contrast, ...]
     #: posterior probability of the accepted sets beside no effect, an unknown effect and every effect alone that is in
     #: none of them; the three kinds (no effect, known, unknown) are equally probable before, and look-elsewhere is
@@ -159,7 +157,6 @@ def attributed(selection: "Selection", gap: GlobalTest | None = None) -> Attribu
         nearest=nearest,
         cosine=float(np.sqrt(max(signal, 0.0) / excess)),
         singles=tuple(selection.fit(first, (place,)) for place in range(len(candidates))),
-        correlation=cosines(groups),
         contrasts=tuple(selection.contrasts(explanations)),
         probability=selection.probability(accepted) if accepted else 0.0,
     )

@@ -7,7 +7,7 @@ import numpy as np
 
 from mcsim.datavector.campaign import Ask
 from mcsim.datavector.halves import Halves
-from mcsim.diagnosis.nuisance_result import NuisanceResult
+from mcsim.datavector.nuisances import NuisanceResult
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.words import refuted

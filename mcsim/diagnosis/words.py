@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mcsim.datavector.localisation import Place
-from mcsim.diagnosis.nuisance_result import NuisanceResult
+from mcsim.datavector.nuisances import NuisanceResult
 from mcsim.diagnosis.result import Agreement, DiagnosisResult, EffectResult, EffectSet
 from mcsim.diagnosis.selection import Contrast
 from mcsim.stats.excess import HeldOut, Measured

@@ -259,3 +259,54 @@ def _of_path(path: str, written: str) -> Any:
             del sys.modules[name]
             raise
     return sys.modules[name]
+
+
+@dataclass(frozen=True, eq=False)
+class ExternalModel:
+    """A model whose maps another program simulates.
+
+    Parameters
+    ----------
+    description
+        Sky, beams, scans and noise of the instrument: a run. With it maps are filtered, and the responses to effects
+        that the other program cannot add are simulated.
+    simulator
+        Where the maps come from. A function ``simulate(seed, effects=())``, or an object with such a method, or its
+        class (made with the description if it takes an argument), or ``"package.module:name"`` of these: it returns
+        maps, uK, RING order, in the description's frame and after its preparation, as a dict or xarray object by
+        channel, or by channel and split. Or stored maps: the template of FITS files with {realization}, {channel} and
+        {split}; a Zarr store; an xarray object or array with the dimension ``realization``.
+
+    Notes
+    -----
+    A simulator has the attribute ``effects``, names of the effects that it can add, if there are any: it is then called
+    with a tuple of :class:`mcsim.config.Effect`, each with ``name``, ``channel`` and ``parameters``. With a keyword
+    ``sky`` it is given coefficients a_lm, uK, in place of a sky of its own. An attribute ``state`` stands for what it
+    depends on besides its source code; default: all that the object holds.
+
+    Examples
+    --------
+    >>> import healpy, numpy as np
+    >>> import mcsim
+    >>> def white(seed):
+    ...     return {"demo": np.random.default_rng(seed).normal(scale=50.0, size=healpy.nside2npix(16))}
+    >>> mcsim.ExternalModel("tiny", white).description
+    'tiny'
+    """
+
+    description: str | Path | Mapping[str, Any] | config.RunConfig
+    simulator: Any
+
+
+def loaded(
+    model: str | Path | Mapping[str, Any] | config.RunConfig | ExternalModel,
+) -> tuple[config.RunConfig, Source | None]:
+    """Return the run that a model is or that describes it, and its source of maps; None: mcsim itself."""
+    given = model.description if isinstance(model, ExternalModel) else model
+    run = config.load(given)
+    bare, named = named_source(run)
+    if isinstance(model, ExternalModel):
+        if named is not None:
+            raise InputError(f"{run.name} names the simulator {named!r} already; give the run or the simulator alone.")
+        return bare, source_of(bare, model.simulator)
+    return bare, None if named is None else source_of(bare, named)

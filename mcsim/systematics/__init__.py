@@ -20,7 +20,7 @@ from mcsim.systematics.base import (
     tried,
     variance_factor,
 )
-from mcsim.systematics.hooks import HookError
+from mcsim.systematics.hooks import HookError, if_possible
 from mcsim.systematics.parametrization import Parametrization
 from mcsim.systematics.registry import Library, basis_of, build, called, catalogue, checked, effects, get, in_file
 
@@ -46,6 +46,7 @@ __all__ = [
     "disturbing",
     "effects",
     "get",
+    "if_possible",
     "in_file",
     "looked_at",
     "reach",

@@ -1,7 +1,8 @@
 """The hooks by which an effect acts, and what those of a user's effect may return."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,17 @@ _OPTIONAL = ("gain", "noise", "moved", "lags")  #: hooks that may return None
 
 class HookError(InputError):
     """A hook of an effect that fails, or returns what it should not: never a reason to leave the effect out."""
+
+
+@contextmanager
+def if_possible() -> Iterator[None]:
+    """Leave a block where an effect cannot have what it is given; a hook that fails stays a :class:`HookError`."""
+    try:
+        yield
+    except HookError:
+        raise
+    except InputError:
+        pass
 
 
 def guard(kind: type) -> None:

@@ -64,8 +64,16 @@ def diagnosed(run, output, count, workers=0):
         return mcsim.diagnose(run, data_of(run), output, settings=settings(controls=count), workers=workers)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """Tests that run beside each other would draw each other's controls in one cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MCSIM_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture(scope="module")
-def sound(tmp_path_factory):
+def sound(tmp_path_factory, cache):
     """A model that simulates what its pixels see, and its diagnosis with controls."""
     folder = tmp_path_factory.mktemp("sound")
     return diagnosed(model(50), folder, COUNT), folder

@@ -25,6 +25,7 @@ from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.ensemble.maps import POINTING, file_names, write_map
 from mcsim.errors import InputError
+from mcsim.reconstruction.result import HEAD
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.stats.look_elsewhere import global_test
@@ -425,13 +426,21 @@ def test_a_beam_that_no_effect_changes_has_no_single_name(small):
     assert found["verdict"] in ("unknown", "mixture", "degenerate")
 
 
-def test_the_verdict_is_json_and_the_evidence_opens(small, tmp_path):
+def test_the_verdict_is_json_and_the_evidence_opens(small, tmp_path, monkeypatch):
     found = diagnose_data(ObservedMaps(small, list(simulate.maps(data_of(small.run), 0)), ask), "saved")
     found.save(tmp_path / "out", "page")
     assert json.loads((tmp_path / "out" / "verdict.json").read_text())["schema"] == 1
     assert (tmp_path / "out" / "report.html").read_text() == "page"
     found.save(tmp_path / "out")  # whose report is none of this call
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["diagnosis.zarr", "verdict.json"]
+    # A description that a nuisance of the run is stays, one that nothing uses does not; "~" is the home.
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("unlisted_1.py", "unlisted_2.py"):
+        (tmp_path / "out" / name).write_text(HEAD)
+    run = {**json.loads(found.configuration), "nuisance": [{"effect": str(tmp_path / "out" / "unlisted_1.py")}]}
+    replace(found, configuration=json.dumps(run)).save("~/out")
+    assert [path.name for path in (tmp_path / "out").glob("*.py")] == ["unlisted_1.py"]
+    assert DiagnosisResult.open("~/out").kind == found.kind
 
 
 def test_responses_on_the_observed_sky_have_the_mean_of_those_on_any(small):

@@ -73,7 +73,7 @@ def test_what_is_there_stays_whole_where_the_next_does_not_fit(disk: Path, monke
     with refused(disk, by=RunError, errno=errno.ENOSPC), filling(disk):
         write_dataset(large, disk / "x.zarr")
     with refused(disk, by=RunError, errno=errno.ENOSPC), filling(disk):
-        report.write(None, disk / "report.html")
+        write_whole(disk / "report.html", report.page(None))
     xr.testing.assert_identical(xr.open_zarr(disk / "x.zarr", chunks=None), small)
     assert (disk / "report.html").read_text() == "first"
     assert sorted(path.name for path in disk.iterdir()) == ["report.html", "x.zarr"]

@@ -138,6 +138,8 @@ def test_a_calibration_far_beyond_its_prior_is_named(run, declared):
     # Its error has the prior, which is part of the model, but for what 500 standard deviations change in the response.
     assert best.sigma > 0.5 * WIDTH
     assert best.amplitude == pytest.approx(10.0 * WIDTH, abs=4.0 * best.sigma)
+    (alone,) = [one for one in beyond.candidates if (one.name, one.channel) == ("calibration", "W1")]
+    assert alone.sigma == pytest.approx(best.sigma, rel=0.1)  # has the prior, too
 
 
 def test_a_calibration_far_beyond_its_prior_is_no_dipole_and_no_ring_of_the_beam(run):

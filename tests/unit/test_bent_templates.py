@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from mcsim.datavector.bent import bent_templates
 from mcsim.datavector.candidate import Candidate
-from mcsim.diagnosis.bent import bent_templates
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.systematics import Effect, Parametrization
 

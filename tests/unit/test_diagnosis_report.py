@@ -139,7 +139,8 @@ def diagnosis(kind: str) -> DiagnosisResult:
     data = SimpleNamespace(
         context=context, x=x, places=lambda: where, residual_maps=lambda: sky, provenance=lambda: {"level": 0.05}
     )
-    return result_of(data, f"case <i>{kind}</i>", Refined(found, t, ()), reduction, ["a <b>note</b> & so"])
+    refined = Refined(found, t, context.candidates, t)
+    return result_of(data, f"case <i>{kind}</i>", refined, reduction, ["a <b>note</b> & so"])
 
 
 class Page(HTMLParser):

@@ -34,7 +34,7 @@ def named() -> SimpleNamespace:
     x = S * t[:, 1] + rng.normal(size=P)
     found = attribute(null, x, t[:, :3], candidates, calibrate(null, groups, draws=2000))
     assert [one.members for one in found.explanations] == [(1,)]
-    return SimpleNamespace(null=null, x=x, t=t, refined=Refined(found, t[:, :3], candidates))
+    return SimpleNamespace(null=null, x=x, t=t, refined=Refined(found, t[:, :3], candidates, t[:, :3]))
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element
 from mcsim.diagnosis.api import _key, describe
-from mcsim.diagnosis.nuisance_result import results
 from mcsim.information.result import marginalised
 from mcsim.simulation import simulate
 from mcsim.simulation.nuisance import DisturbedSurvey, Nuisance, check_nuisances, draws, nuisances_of, tables
@@ -440,7 +439,7 @@ def test_results_say_prior_posterior_and_pull():
         Nuisance(systematics.get("calibration"), "W1", (0.1,)),
         Nuisance(systematics.get("foreground_residual"), None, (2.0,), {}, {"spectral_index": 0.3}),
     ]
-    one, two = results(priors, Regression.of(known, known.gaussian), known.simulations.mean(axis=0) + 0.3 * t[:, 0])
+    one, two = Regression.of(known, known.gaussian).results(priors, known.simulations.mean(axis=0) + 0.3 * t[:, 0])
     assert (one.name, one.channel, one.component, one.prior_width) == ("calibration", "W1", None, 0.1)
     assert one.amplitude == pytest.approx(0.3, rel=0.1)
     assert one.pull == pytest.approx(one.amplitude / np.sqrt(0.1**2 - one.sigma**2))

@@ -21,8 +21,8 @@ import mcsim
 from mcsim import config
 from mcsim.datavector import campaign
 from mcsim.datavector.analysis import analysis_of, data_vectors
+from mcsim.diagnosis.agreement import agreement
 from mcsim.diagnosis.context import context
-from mcsim.diagnosis.external import agreement
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.ensemble.external import source_of

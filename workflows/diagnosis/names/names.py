@@ -285,7 +285,7 @@ def true(number):
             for null, seen, t in ((known.null, x, known.templates), (wide, z, whole)):
                 named, counted = found, [*counted, *row]
                 if len(found.explanations) == 1:
-                    refined = Refined(found, t, known.candidates)
+                    refined = Refined(found, t, known.candidates, t)
                     if near := [rivals[index] for index, _ in in_place(null, seen, refined, rivals, known.settings)]:
                         more = with_candidates(known, near)
                         named = attribute(more.null, x, more.templates, more.candidates, more.calibration)

@@ -6,7 +6,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from mcsim.datavector.candidate import Candidate
-from mcsim.diagnosis.partial import beyond
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import acts_through
@@ -40,6 +39,18 @@ def bent_templates(
         response = t[:, columns] @ best + curvature[:, columns] @ best**2
         bent[:, columns] += beyond(null, t[:, columns], best, response)
     return bent
+
+
+def beyond(null: SimulatedGaussian, t: Matrix, at: Vector, response: Vector) -> Matrix:
+    """Return what makes templates, shape (p, k), exact at coordinates: the response beyond their sum.
+
+    It is shared in proportion to the squared white norms of the parts, so that a weakly constrained one, whatever
+    its fitted coordinate, does not change.
+    """
+    parts = t * at
+    weights = np.sum(null.whiten_templates(parts) ** 2, axis=0)
+    shares = np.divide(weights, at * weights.sum(), out=np.zeros_like(at), where=weights > 0.0)
+    return np.outer(response - parts.sum(axis=1), shares)
 
 
 def _fit(y: Vector, straight: Matrix, square: Matrix, first: Vector) -> Vector | None:
