@@ -18,7 +18,7 @@ from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.ensemble.plan import cost
 from mcsim.errors import InputError, RunError
 from mcsim.support import folders
-from mcsim.support.code import package_digest
+from mcsim.support.code import class_digest, package_digest
 from mcsim.support.npy import read_npy
 from mcsim.support.numbers import duration
 from mcsim.support.progress import reporting
@@ -49,7 +49,9 @@ def diagnose_controls(known: DiagnosisContext, key: str, count: int, call: Batch
     with reporting("orientation moments of the controls", 1.0, "", quiet) as report:
         drawn = fidelity(known.analysis, os.cpu_count() or 1)
         report(1.0)
-    code = package_digest(["mcsim.diagnosis"])
+    code = [package_digest(["mcsim.diagnosis", "mcsim.datavector.faithful"])]
+    # Effects that are proposed on request alone are no part of the key, and may be what a control is called.
+    code += [class_digest(kind) for _, kind in known.analysis.library]
     text = json.dumps([key, config.science(drawn.run), drawn.sample_by_sample, code], sort_keys=True)
     folder = folders.default_cache_dir().absolute() / "controls" / hashlib.sha256(text.encode()).hexdigest()[:32]
     verdicts = {number: one for number in range(count) if (one := _read(folder, number)) is not None}
