@@ -279,8 +279,8 @@ class SameSkies:
     def ahead(self, each: Sequence[config.Effect], skies: int, odd: bool = False) -> None:
         """Simulate single effects at once that :meth:`of_reference` or :meth:`pair` will be asked for one by one.
 
-        ``odd``: :meth:`odd` will be.
-        One by one they would leave workers waiting. InputError if one of them cannot be simulated.
+        One by one they would leave workers waiting. ``odd``: it is :meth:`odd` that will be asked. InputError if one of
+        them cannot be simulated.
         """
         kinds = [([*without_repeats(self.noise, [effect]), effect], self.skies_of(effect)) for effect in each]
         sets = [(found, kind == "constrained", None if kind == "reference" else skies) for found, kind in kinds]
