@@ -239,6 +239,8 @@ def summary(result: DiagnosisResult, folder: Path) -> list[str]:
     rows.append(("verdict", f"{result.kind}. {status(result)}"))
     shown = result.sets[: SETS + 1]
     rows += [("or" if one is not shown[0] else "effect", _numbered(one.effects)) for one in shown]
+    if more := len(result.sets) - len(shown):
+        rows.append(("or", f"{more} more set{'s' * (more > 1)} in verdict.json"))
     rows += [("detected", _numbered(result.partial))] if result.partial else []
     if result.sets:
         if tests := [one.pvalue for effect in result.effects for one in effect.consistency]:

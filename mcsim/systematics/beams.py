@@ -263,7 +263,7 @@ class BeamSidelobe(Effect):
     scope = "channel"
     unit = "fraction of the peak"
     wording = Wording("negative ring of {} of the peak", " %", 100.0, negative="ring of {} of the peak")
-    cause = "Spill-over, struts or panels of the mirror; negative where two horns are subtracted."
+    cause = "Spill-over, struts or panels of the mirror; negative, of positive amplitude, where horns are subtracted."
     signature = "A halo at low l, pick-up of the plane and the dipole, and with q the m = 2 part of b_lm."
     source = "Barnes et al. 2003, ApJS 148, 51 (WMAP's sidelobes, negative and positive); the shape is a model"
     step = 1e-5

@@ -64,17 +64,27 @@ def _guarded(hook: str, function: Callable[..., Any]) -> Callable[..., Any]:
     def call(effect: Any, *given: Any, **named: Any) -> Any:
         what = f"effect {effect.name}: its {hook}"
         try:
-            found = function(effect, *given, **named)
+            found = function(effect, *map(_read_only, given), **{key: _read_only(one) for key, one in named.items()})
             flaw = _flaw(hook, found, (*given, *named.values()))
         except InputError:
             raise
         except Exception as error:  # whatever a user's code does
-            raise HookError(f"{what} fails ({type(error).__name__}: {error}); mend it.") from error
+            remedy = "let it change a copy" if "read-only" in str(error) else "mend it"
+            raise HookError(f"{what} fails ({type(error).__name__}: {error}); {remedy}.") from error
         if flaw is not None:
             raise HookError(f"{what} returns {flaw}; let it return {_RETURNED[hook]}.")
         return found
 
     return call
+
+
+def _read_only(value: Any) -> Any:
+    """Return an array that a hook cannot write to: other channels, and the control, have the same one."""
+    if not isinstance(value, np.ndarray):
+        return value
+    view = value.view()
+    view.flags.writeable = False
+    return view
 
 
 def _flaw(hook: str, found: Any, given: Sequence[Any]) -> str | None:

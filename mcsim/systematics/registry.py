@@ -141,7 +141,10 @@ def of_file(path: str) -> type[Effect]:
     found = in_file(path)
     if len(found) != 1:
         raise InputError(f"{path} defines {len(found)} effects; let it define one class derived from mcsim.Effect.")
-    return found[0]
+    (kind,) = found
+    if catalogue().get(kind.name, kind) is not kind:
+        raise InputError(f"{path} defines {kind.name}, which is an effect of the library; give it another name.")
+    return kind
 
 
 def in_file(path: str) -> tuple[type[Effect], ...]:

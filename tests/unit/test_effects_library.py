@@ -329,6 +329,20 @@ def test_a_hook_that_returns_something_else_says_which(hook, returned, named, si
         getattr(effect, hook)(given)
 
 
+def test_a_hook_cannot_write_to_what_other_channels_see(site):
+    """A glow that was added in place in one channel was in all channels, and in the control, too."""
+
+    def glow(self, sky, site, draw):
+        sky[0] += self.amplitude
+        return sky
+
+    sky = np.zeros(alm_.size(LMAX), dtype=complex)
+    with refused("foreign", "sky", "read-only", "copy"):
+        systematics.looked_at([whole(sky=glow)(amplitude=1.0)], sky, site, 0, 0)
+    assert not sky.any()
+    assert sky.flags.writeable
+
+
 def test_effects_of_one_name_draw_apart(site):
     once = systematics.build("point_sources", {"amplitude": 1.0})
     sky = np.zeros(alm_.size(LMAX), dtype=complex)
@@ -368,6 +382,17 @@ def test_a_file_that_is_mended_is_run_anew(tmp_path, monkeypatch):
             systematics.get(str(path))
     path.write_text(f"{lines}    unit = 'uK'\n")
     assert systematics.get(str(path)).unit == "uK"
+
+
+def test_a_file_whose_effect_has_the_name_of_a_built_in_one_is_refused(tmp_path, monkeypatch):
+    """It stood in the library for that one, and its verdict would have been read so."""
+    monkeypatch.setattr("sys.path", list(sys.path))
+    monkeypatch.setenv("PYTHONPATH", "")
+    path = tmp_path / "of_a_name.py"
+    lines = "from mcsim.reconstruction import AddedPattern\n\n\nclass Of(AddedPattern):\n    name = 'calibration'\n"
+    path.write_text(lines)
+    with refused(str(path), "calibration"):
+        systematics.get(str(path))
 
 
 def test_a_file_named_like_a_module_of_python_or_no_module_is_refused(tmp_path, monkeypatch):
