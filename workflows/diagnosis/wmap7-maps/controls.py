@@ -15,7 +15,7 @@ from scipy import stats
 import mcsim
 from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.campaign import asking, batch
-from mcsim.diagnosis import controls
+from mcsim.datavector.faithful import fidelity
 from mcsim.diagnosis.api import kept, prepared
 from mcsim.diagnosis.control_result import Control, Controls
 from mcsim.simulation import simulate
@@ -33,7 +33,7 @@ def main() -> None:
     analysis = analysis_of(run)
     with batch(1) as call, asking(call, False, kept=kept(run, analysis)) as ask:
         known = prepared(run, analysis, ask)
-    drawn = controls.fidelity(analysis)
+    drawn = fidelity(analysis)
     shared, found = DisturbedSurvey.of(drawn.run, dict(analysis.library)), []
     for number in range(chosen.count):
         x = analysis.data_vector(list(simulate.maps(shared.at(number), number)))
