@@ -5,7 +5,6 @@ python names.py true [NUMBER]      one effect of the library, added to data vect
 python names.py further [NUMBER]   beside a strong effect: how often is another one found that is not there?
 python names.py bent [CASES]       an ellipticity whose response bends, in simulated maps: pulls of its amplitudes
 python names.py noisy [CASES]      20 to 100 % more noise in one channel, in simulated maps: is that named?
-python names.py modulated [CASES]  a modulation of the sky, in simulated maps: is that named? pulls of its amplitude
 python names.py draws [NUMBER]     effects of the library, added to data vectors of simulations
 python names.py several [NUMBER]   one to five effects of the library at once, added to data vectors
 python names.py pairs [CASES]      two effects of the library at once, in simulated maps
@@ -401,28 +400,6 @@ def noisy(number):
         print(f"    pulls {np.mean(pulls):.2f} in the mean, rms {np.sqrt(np.mean(pulls**2)):.2f}", flush=True)
 
 
-def modulated(number):
-    """Diagnose maps with a modulation of any direction; print how often it is named, and pulls of its amplitude."""
-    run, context = learned(MODEL)
-    for own in (one for one in context.candidates if one.name in ("dipole_modulation", "quadrupole_modulation")):
-        for amplitude in (0.05, 0.15):
-            alone, pulls = 0, []
-            for case in range(number):
-                direction = np.random.default_rng([31, case]).normal(size=len(own.columns))
-                size = amplitude / np.linalg.norm(direction)
-                effect = own.with_coordinates(size * direction, np.eye(len(direction)))
-                shared = survey(with_effects(seeded(run, 8000), [own.table(effect)]))
-                maps_uk = list(simulate.maps(shared, case))
-                verdict = diagnose_data(ObservedMaps(context, maps_uk, ask), f"{own.name}-{case}")
-                found = [one.effects[0] for one in verdict.sets if [e.name for e in one.effects] == [own.name]]
-                alone += len(found) == len(verdict.sets) == 1
-                pulls += [(one.amplitude - amplitude) / one.sigma for one in found]
-            print(f"{own.name} {amplitude}: {len(pulls)} of {number} are in the set, {alone} alone")
-            print(
-                f"    pulls {np.mean(pulls):.2f} in the mean, rms {np.sqrt(np.mean(np.square(pulls))):.2f}", flush=True
-            )
-
-
 def pairs(number):
     """Diagnose maps with two effects, each at S/N 5 to 20, and print how often both are named."""
     from mcsim.benchmark.case import Prior
@@ -506,5 +483,5 @@ def null(number):
 
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    commands = (maps, true, further, bent, noisy, modulated, draws, pairs, several, null)
+    commands = (maps, true, further, bent, noisy, draws, pairs, several, null)
     {one.__name__: one for one in commands}[sys.argv[1]](int(sys.argv[2]) if len(sys.argv) > 2 else 42)
