@@ -9,7 +9,7 @@ from mcsim.errors import InputError
 from mcsim.simulation.channels import described, effects_on, known_offsets, load_beam, site_of, with_all_orders
 
 SAMPLES = 100_000_000  #: samples of the longest survey that is simulated sample by sample
-STAGES = ("sky", "beam", "pointing", "gain", "signal", "spread", "orientations")
+STAGES = ("sky", "beam", "pointing", "gain", "steady_gain", "signal", "spread", "orientations")
 """Where an effect must act to change a map without noise."""
 
 EXTRA_ORDERS = 3  #: moments beyond the beam's orders: a displaced beam has them

@@ -176,7 +176,7 @@ def _candidates(model: Model, kinds: Sequence[tuple[str, type[Effect]]]) -> Iter
         # A nuisance is fitted in the coordinates of its prior.
         fit = effect.parametrization if name in declared else effect.parametrization.seen_at(frequencies)
         for channel in (None,) if effect.scope == "common" else model.channels:
-            for fixed in effect.variants:
+            for fixed in effect.variants_in(run.map.splits):
                 if _hindrance(model, effect, channel, fixed) is None:
                     columns = tuple(range(len(fit.basis())))
                     yield Candidate(effect, channel, columns, dict(fixed), step=_step(model, effect, channel), fit=fit)
@@ -202,8 +202,8 @@ def _hindrance(model: Model, kind: type[Effect], channel: str | None, settings: 
     owners = [c for c in model.survey.channels if channel in (None, c.name)]
     if acts_through(kind, "differencing") and any(owner.side_b is None for owner in owners):
         return "it acts on differencing, and the scan has none"
-    if acts_through(kind, "excess") and any(owner.side_b is not None for owner in owners):
-        return "it disturbs the samples of one beam, and the scan takes differences of two"
+    if acts_through(kind, "excess", "steady_gain") and any(owner.side_b is not None for owner in owners):
+        return "it acts on the samples of one beam, and the scan takes differences of two"
     drawn = [m.drawn for owner in owners for m in owner.maps]
     if acts_through(kind, "knee") and not all(isinstance(one, CorrelatedNoise) for one in drawn):
         return "it moves the knee of noise with memory, and that of the maps has none"
@@ -235,7 +235,8 @@ def check_asked(analysis: Analysis, names: Sequence[str]) -> None:
     for name in missing:
         kind = dict(analysis.library)[name]
         places = (None,) if kind.scope == "common" else analysis.model.channels
-        reasons = [_hindrance(analysis.model, kind, place, dict(fixed)) for place in places for fixed in kind.variants]
+        variants = kind.variants_in(analysis.run.map.splits)
+        reasons = [_hindrance(analysis.model, kind, place, dict(fixed)) for place in places for fixed in variants]
         why = next((reason for reason in reasons if reason is not None), "what is measured does not show it")
         raise InputError(f"effect {name} is asked for, but cannot be found in this model: {why}; leave it out.")
 

@@ -24,7 +24,7 @@ def bent_templates(
     bent, y = t.copy(), null.whiten(x)
     for candidate in candidates:
         how = candidate.parametrization
-        in_proportion = how.proportional or acts_through(candidate.effect, "sky", "signal", "gain")
+        in_proportion = how.proportional or acts_through(candidate.effect, "sky", "signal", "gain", "steady_gain")
         if how.stochastic or candidate.nuisance or not in_proportion:
             continue
         columns = list(candidate.columns)

@@ -15,7 +15,7 @@ from mcsim.bipolar import by_degree
 from mcsim.datavector.filter_model import Model
 from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.simulation import differencing
-from mcsim.simulation.pixel_means import Part, gain_of, signal_of
+from mcsim.simulation.pixel_means import Part, drifts, gain_of, signal_of
 from mcsim.simulation.survey import Channel, SurveyMap
 from mcsim.sphere import healpix
 from mcsim.sphere.sky import dipole_alm
@@ -45,7 +45,8 @@ def matched_filter(model: Model, effect: Effect, channel: int | None) -> Matched
     if factor is not None:
         change = np.asarray(factor) - 1.0
         return lambda filtered: float(np.dot(filtered.squares[channel], change))
-    return None if effect.gain(np.zeros(1), owner.site) is None else _gain_filter(model, effect, channel)
+    erring = drifts(effect, owner.site) or acts_through(effect, "steady_gain")
+    return _gain_filter(model, effect, channel) if erring else None
 
 
 def _sky_filter(model: Model, effect: Effect, channel: int | None) -> MatchedFilter:
@@ -98,7 +99,10 @@ def _gain_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter:
     site, parts, lmax = model.survey.channels[channel].site, model.of(channel), max(model.lmax, 1)
     # Of as many orders as the simulations need: one pass over the pointing for both.
     orders, run = model.survey.channels[channel].beam.mmax, model.survey.config
-    errors = [gain_of(effect, site, Part.of(run, n), orders)[0].real for n in range(len(parts))]
+    errors = []
+    for part in (Part.of(run, n) for n in range(len(parts))):
+        steady = effect.steady_gain(replace(site, split=part.split))
+        errors.append(steady + (gain_of(effect, site, part, orders)[0].real if drifts(effect, site) else 0.0))
     dipole = healpix.synthesis(dipole_alm(site.dipole_uk, lmax)[None], model.nside, lmax)[0]
 
     def value(filtered: FilteredMaps) -> float:

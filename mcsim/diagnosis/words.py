@@ -254,6 +254,7 @@ def summary(result: DiagnosisResult, folder: Path) -> list[str]:
     rows += [("note", note) for note in result.notes]
     rows += [("note", f"{untested(result)} The report lists them.")] if result.untested else []
     rows += [("missing", line) for line in unlisted(result)]
+    rows += [("looks like", f"{one.cause}.") for one in result.unlisted or () if one.cause]
     files = [f"{one.name}.py" for one in result.unlisted or () if one.file is not None]
     rows.append(("written", f"{folder}: {', '.join(['verdict.json', 'report.html', 'diagnosis.zarr', *files])}"))
     return [f"{name:<14}{text}" for name, text in rows]

@@ -45,7 +45,7 @@ EVEN, MOVED = 1e-6, 0.01
 
 NEGLIGIBLE = 1e-3  #: dipole that is left in samples, over the rms of the sky, that a prediction may not have
 
-_LEFT_OUT = ("sky", "gain", "signal", "excess")  #: hooks of effects that no prediction follows
+_LEFT_OUT = ("sky", "gain", "steady_gain", "signal", "excess")  #: hooks of effects that no prediction follows
 
 
 @dataclass(frozen=True)

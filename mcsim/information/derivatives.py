@@ -25,7 +25,10 @@ DRAWS = 64  #: realizations that the mean of an effect of random shape is estima
 STEP = 0.1  #: share of an effect's ``step``: an ellipticity of either sign bends the response by half of itself
 NEGLIGIBLE = 1e-12  #: orders whose derivative is below this share of the largest are rounding
 
-_HOOKS = ("sky", "beam", "pointing", "gain", "signal", "noise", "excess", "spread", "orientations", "differencing")
+_HOOKS = (
+    *("sky", "beam", "pointing", "gain", "steady_gain", "signal", "noise", "excess"),
+    *("spread", "orientations", "differencing"),
+)
 
 
 @dataclass(frozen=True, eq=False)

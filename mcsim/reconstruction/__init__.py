@@ -8,6 +8,7 @@ from mcsim.reconstruction.forms import (
     CompactSource,
     Elsewhere,
     GainOfOne,
+    GainOfSplits,
     GainOverTime,
     GainPattern,
     NoisePattern,
@@ -18,5 +19,5 @@ from mcsim.reconstruction.forms import (
 
 __all__ = [
     "AddedPattern", "AddedToSamples", "BeamOrder", "BoostedSky", "CompactSource", "Elsewhere", "GainOfOne",
-    "GainOverTime", "GainPattern", "NoisePattern", "RotatedSky", "SignalPower", "SkyPower",
+    "GainOfSplits", "GainOverTime", "GainPattern", "NoisePattern", "RotatedSky", "SignalPower", "SkyPower",
 ]  # fmt: skip

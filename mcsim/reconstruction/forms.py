@@ -213,6 +213,23 @@ class BeamOrder(ByFrequency):
 
 
 @dataclass(frozen=True, kw_only=True)
+class GainOfSplits(ByFrequency):
+    """The gain of sky and dipole errs by ``factor`` times a number for each split of the survey, at all its times."""
+
+    factor: ClassVar[float]
+    splits: ClassVar[dict[str, float]]
+
+    def steady_gain(self, site: Site) -> float:
+        """Return the error of a split; InputError in a survey of other splits."""
+        if set(site.splits) != set(self.splits):
+            raise InputError(
+                f"effect {self.name} was reconstructed in splits {', '.join(self.splits)}, but those of {site.channel} "
+                f"are {', '.join(site.splits) or 'none'}; name them alike."
+            )
+        return self.amplitude * self.seen(site) * self.factor * self.splits.get(site.split or "", 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
 class InTime(Form):
     """Derive forms that depend on time from this class."""
 
@@ -396,8 +413,8 @@ def _maps_of(
 FORMS: dict[str, type[Form]] = {
     kind.__name__: kind
     for kind in (
-        AddedPattern, CompactSource, GainPattern, RotatedSky, BoostedSky, SignalPower, SkyPower, BeamOrder,
-        AddedToSamples, GainOverTime, GainOfOne, Elsewhere, NoisePattern,
+        AddedPattern, CompactSource, GainPattern, GainOfSplits, RotatedSky, BoostedSky, SignalPower, SkyPower,
+        BeamOrder, AddedToSamples, GainOverTime, GainOfOne, Elsewhere, NoisePattern,
     )
 }  # fmt: skip
 """The forms by the name of their class."""

@@ -11,7 +11,7 @@ import numpy as np
 from mcsim.reconstruction.forms import FORMS, Form, Towards
 from mcsim.reconstruction.grammar import LOBE
 from mcsim.reconstruction.result import HEAD
-from mcsim.reconstruction.scores import ELSEWHERE, MONTH, Scene
+from mcsim.reconstruction.scores import ACTED_ON, ELSEWHERE, MONTH, Scene
 from mcsim.reconstruction.structure import ALIKE, OPPOSITE, Structure
 from mcsim.reconstruction.time_functions import HISTORIES
 from mcsim.support.arrays import Vector
@@ -140,6 +140,9 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
         case "elsewhere", _ if alike:
             acting = {"towards": _towards(structure, scene), "on_dipole": "dipole" in structure.acts_on}
             return "Elsewhere", {"factor": float(theta[0]), "top": ELSEWHERE, **acting}
+        case "gain", _ if not alike and structure.kind == "constant" and _whole(structure, scene):
+            shares = dict(zip(scene.splits, splits["splits"], strict=True))
+            return "GainOfSplits", {"factor": float(theta[0]) / CONSTANT, "splits": shares}
         case "gain", _ if not alike:
             value = float(theta[0]) / (1.0 if structure.acts_on == "dipole" else CONSTANT)
             timed |= {"coefficients": (value,)} if structure.kind == "constant" else {"wave": "sky"}
@@ -175,6 +178,11 @@ def _form(structure: Structure, theta: Vector, scene: Scene) -> tuple[str, dict[
             pattern = (*(0.0,) * degree**2, *pattern)
             return "GainPattern", {"coefficients": pattern, "on_sky": True, "on_dipole": False}
     return None
+
+
+def _whole(structure: Structure, scene: Scene) -> bool:
+    """Return True for what acts on all that a survey sees: on the sky alone, too, where there is no dipole."""
+    return structure.acts_on == ACTED_ON[0] or (structure.acts_on == ACTED_ON[1] and not scene.dipole_uk.any())
 
 
 def _wave(structure: Structure) -> dict[str, Any]:

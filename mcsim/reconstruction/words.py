@@ -33,6 +33,8 @@ _LIKE: tuple[tuple[str, str, str, str], ...] = (
 def cause(structure: Structure, library: Library) -> str:
     """Return a known cause of such structures with its reference, or nothing."""
     name = "foreground_residual" if structure.index is not None and structure.stage == "added" else ""
+    if (structure.stage, structure.kind) == ("gain", "constant") and structure.split not in (ALIKE, OPPOSITE):
+        name = "split_calibration"
     for stage, frame, kind, effect in _LIKE if not name else ():
         if structure.stage == stage and structure.frame == frame and structure.kind.startswith(kind):
             name = effect
@@ -41,7 +43,8 @@ def cause(structure: Structure, library: Library) -> str:
         return ""
     kind_ = library[name]
     source = f" ({kind_.source})" if kind_.source else ""
-    return f"{kind_.label()}: {kind_.cause.rstrip('.')}{source}"
+    tried = "" if kind_.proposed else f"; --with {name} proposes it"
+    return f"{kind_.label()}: {kind_.cause.rstrip('.')}{source}{tried}"
 
 
 def says(structure: Structure, theta: Vector, scene: Scene) -> str:

@@ -242,6 +242,12 @@ def refuse_excess(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
                 f"effect {effect.name} on channel {channel} acts on orientation moments, but the scan takes "
                 'differences, which have none; remove it, or give a scan of kind "hit_averaged".'
             )
+    for effect in acting:
+        if effect.amplitude != 0.0 and systematics.acts_through(effect, "steady_gain"):
+            raise InputError(
+                f"effect {effect.name} on channel {channel} acts on maps of one beam, but the scan takes differences; "
+                'remove it, or give a scan of kind "hit_averaged".'
+            )
     for effect, _ in systematics.disturbing(acting):
         raise InputError(
             f"effect {effect.name} on channel {channel} adds noise to samples of one beam, but the scan takes "
@@ -300,8 +306,9 @@ def known_offsets(run: config.RunConfig, spec: config.Channel) -> int:
 
 def refuse_pixel_effects(channel: str, acting: tuple[systematics.Effect, ...]) -> None:
     """Refuse effects that act on pixels, for a grid of rings."""
+    hooks = ("gain", "steady_gain", "signal", "noise", "excess", "spread", "orientations")
     for effect in acting:
-        if systematics.acts_through(effect, "gain", "signal", "noise", "excess", "spread", "orientations"):
+        if systematics.acts_through(effect, *hooks):
             raise InputError(
                 f'effect {effect.name} on channel {channel} acts on pixels, but grid = "gl" has none; remove it or set '
                 'map.grid = "healpix".'
@@ -324,6 +331,7 @@ def site_of(run: config.RunConfig, spec: config.Channel) -> systematics.Site:
         dipole_uk=amplitude * (rotation.rotation_matrix("galactic", run.map.frame) @ towards),
         whole=partial(_whole, load_beam, spec, run.sky.lmax) if _is_cut(spec.beam) else None,
         foregrounds=spec.foregrounds,
+        splits=run.map.splits,
     )
 
 

@@ -27,7 +27,7 @@ from mcsim.simulation.pixel_means import (
 from mcsim.simulation.survey import Channel, Survey, survey, with_effects
 from mcsim.sphere import rng
 from mcsim.support.arrays import Vector
-from mcsim.systematics import Effect, Library, acts_through, basis_of, seen_through, spread_of, tried
+from mcsim.systematics import Effect, Library, acts_through, basis_of, seen_through, shared_gain, spread_of, tried
 
 _OF_BEAMS = ("beam", "pointing", "spread")
 
@@ -259,8 +259,8 @@ class DisturbedSurvey:
                 if name == channel.name and not (moved and key == "signal"):
                     coordinates = drawn[number][1].parametrization.coordinates(drawn[number][1])
                     (gains if key == "gain" else signals).append(np.tensordot(coordinates, basis[place], 1))
-            own = with_effects(m, more, site)
-            maps.append(replace(own, gain=_sum(gains), signal_uk=_sum(signals)))
+            own, steady = with_effects(m, more, site), shared_gain(acting, replace(site, split=part.split))
+            maps.append(replace(own, gain=_sum(gains), steady_gain=steady, signal_uk=_sum(signals)))
         return replace(channel, beam=beam, response=response, maps=tuple(maps), effects=acting)
 
     def _orders(self, channel: Channel) -> int:

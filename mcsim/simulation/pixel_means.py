@@ -32,15 +32,19 @@ Terms = list[tuple[float, Effect]]  #: effects, each with a factor
 
 @dataclass(frozen=True)
 class Part:
-    """The samples of one map: a ``share`` of the survey's time, of it every n-th ring from one on; None: all rings."""
+    """The samples of one map: a ``share`` of the survey's time, of it every n-th ring from one on; None: all rings.
+
+    ``split``: the name of the split; None: of a survey that has none.
+    """
 
     share: tuple[float, float]
     rings: tuple[int, int] | None = None
+    split: str | None = None
 
     @classmethod
     def of(cls, run: config.RunConfig, index: int) -> Self:
         """Return the samples of a split of a run."""
-        return cls(run.map.span(index), run.map.rings(index))
+        return cls(run.map.span(index), run.map.rings(index), run.map.each_split[index])
 
 
 def mean_gain(acting: tuple[Effect, ...], site: Site, part: Part, orders: int = 0) -> NDArray[np.complex128] | None:

@@ -40,7 +40,7 @@ def maps(survey: Survey, realization: int, nthreads: int = 1, epsilon: float = E
         check(channel)
         site, acting = channel.site, channel.effects
         seen = systematics.looked_at(acting, sky, site, run.ensemble.seed, realization)
-        after: list[tod.Stage] = [_gained(channel)]
+        after: list[tod.Stage] = []
         if site.dipole_uk.any() and acting:
             seen = seen + dipole_alm(site.dipole_uk, site.lmax)
             fiducial = replace(site.beam, blm=site.beam.blm[:2, :2])
@@ -49,7 +49,8 @@ def maps(survey: Survey, realization: int, nthreads: int = 1, epsilon: float = E
         observe = tod.sky_signal(seen, site.lmax, beam, epsilon, nthreads)
         for index, m in enumerate(channel.maps):
             grid = MapGrid(site.nside, site.frame, run.map.span(index))
-            stages = [*after, _added(channel)]
+            of_split = replace(site, split=run.map.each_split[index])
+            stages = [_gained(acting, of_split), *after, _added(acting, of_split)]
             if (rings := run.map.rings(index)) is not None:
                 stages.append(tod.every_ring(site.pointed("of rings").model.spin_period_s, *rings))
             draw = rng.generator(run.ensemble.seed, realization, f"noise/{m.name}")
@@ -130,13 +131,14 @@ def _spread(channel: Channel, chunk: tod.Samples, reference: tod.Samples) -> tod
     return tod.shrunk(chunk, channel.site.nside, systematics.spread_of(channel.effects), reference)
 
 
-def _gained(channel: Channel) -> tod.Stage:
+def _gained(acting: tuple[systematics.Effect, ...], site: systematics.Site) -> tod.Stage:
     """Return a stage that multiplies the signal by one plus the errors of the gain."""
+    steady = systematics.shared_gain(acting, site)
 
     def gained(chunk: tod.Samples) -> Map:
-        gain = np.ones(chunk.time_s.size)
-        for effect in channel.effects:
-            error = effect.gain(chunk.time_s, channel.site)
+        gain = np.full(chunk.time_s.size, 1.0 + steady)
+        for effect in acting:
+            error = effect.gain(chunk.time_s, site)
             if error is not None:
                 gain = gain + error
         return gain * chunk.signal_uk
@@ -144,12 +146,12 @@ def _gained(channel: Channel) -> tod.Stage:
     return tod.with_signal(gained)
 
 
-def _added(channel: Channel) -> tod.Stage:
+def _added(acting: tuple[systematics.Effect, ...], site: systematics.Site) -> tod.Stage:
     """Return a stage that adds the signals of effects."""
-    acting, site = systematics.adding(channel.effects), channel.site
+    found = systematics.adding(acting)
 
     def added(chunk: tod.Samples) -> Map:
-        signals = (effect.signal(chunk.time_s, chunk.theta, chunk.phi, chunk.psi, site) for effect in acting)
+        signals = (effect.signal(chunk.time_s, chunk.theta, chunk.phi, chunk.psi, site) for effect in found)
         return sum(signals, start=chunk.signal_uk)
 
     return tod.with_signal(added)

@@ -199,7 +199,8 @@ def _map_parts(
             spins[s] = spins[s] - map_uk if s in spins else -map_uk
     flat = made.map(circular) if smooth else None
     whole = None
-    if any(m.gain is not None for m in channel.maps):
+    gains = [_gain_of(m, systematics.spread_of(channel.effects)) for m in channel.maps]
+    if any(gain is not None for gain in gains):
         whole = convolve.CircularMaps(nside, survey.config.sky.lmax, nthreads)
     gradient = None
     terms = _expansion(channel)
@@ -208,7 +209,7 @@ def _map_parts(
         offsets = offset_maps(_unwindowed(channel, seen, dipole), terms, [m.moments for m in channel.maps], nthreads)
     elif any(m.moments.dtheta is not None for m in channel.maps):
         gradient = made.gradient(circular)
-    for index, m in enumerate(channel.maps):
+    for index, (m, gain) in enumerate(zip(channel.maps, gains, strict=True)):
         extra = []
         if terms is not None:
             extra.append(offsets[index])
@@ -219,28 +220,45 @@ def _map_parts(
         for effect, own in systematics.disturbing(channel.effects):
             draw = rng.generator(seed, realization, f"{own}/noise/{m.name}")
             extra.append(divided(effect.excess(m.moments.hits, draw), m.moments.hits))
-        if m.gain is not None and whole is not None:
-            extra.append(_gained(channel, m, whole, convolve.circular_alm(seen, channel.response)))
+        if gain is not None and whole is not None:
+            extra.append(_gained(gain, m, whole, convolve.circular_alm(seen, channel.response)))
         if m.signal_uk is not None:
             extra.append(m.signal_uk)
         difference = convolve.noncircular_map(spins, m.moments) if spins else None
-        if m.gain is not None and seen_spins:
-            drifting = convolve.noncircular_map(seen_spins, replace(m.moments, w=m.gain[2:]))
+        if gain is not None and seen_spins:
+            drifting = convolve.noncircular_map(seen_spins, replace(m.moments, w=gain[2:]))
             difference = drifting if difference is None else difference + drifting
         yield m, MapParts(flat, sum(extra[1:], start=extra[0]) if extra else None, difference)
 
 
-def _gained(channel: Channel, m: SurveyMap, made: convolve.CircularMaps, circular: Alm) -> Map:
+def _gain_of(m: SurveyMap, spread: float) -> NDArray[np.complex128] | None:
+    """Return the means of a map's ``gain`` with what all samples share; None: no error.
+
+    ``spread``: the factor by which samples are nearer to their pixel's centre than where the gain was taken.
+    """
+    if m.gain is None and m.steady_gain == 0.0:
+        return None
+    rows = len(m.moments.w) if m.gain is None else len(m.gain) - 2
+    found = np.zeros((rows + 2, m.moments.npix), dtype=np.complex128)
+    if m.gain is not None:
+        found += m.gain
+        found[1] *= spread
+    found[0] += m.steady_gain
+    if m.moments.dtheta is not None and m.moments.dphi is not None:
+        found[1] += m.steady_gain * (m.moments.dtheta + 1j * m.moments.dphi)
+    found[2:] += m.steady_gain * m.moments.w[:rows]
+    return found
+
+
+def _gained(gain: NDArray[np.complex128], m: SurveyMap, made: convolve.CircularMaps, circular: Alm) -> Map:
     """Return what the error of the gain makes of a sky through the circular part of the beam, samples off the centres.
 
     ``circular``: its a_lm; ``made``: its maps, which splits share.
     """
-    assert m.gain is not None  # the caller looked
-    added = m.gain[0].real * made.map(circular)
+    added = gain[0].real * made.map(circular)
     if m.moments.dtheta is None:
         return added
-    offset = systematics.spread_of(channel.effects) * m.gain[1]
-    off_centre = replace(m.moments, dtheta=offset.real, dphi=offset.imag)
+    off_centre = replace(m.moments, dtheta=gain[1].real, dphi=gain[1].imag)
     return added + convolve.centroid_map(made.gradient(circular), off_centre)
 
 

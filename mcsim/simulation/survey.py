@@ -38,7 +38,7 @@ from mcsim.sphere.checks import check_whole
 from mcsim.sphere.mask import kept_mask
 from mcsim.support.arrays import divided
 from mcsim.support.loading import once_per_content
-from mcsim.systematics import Effect, Library, Site, acts_through, seen_through, spread_of, variance_factor
+from mcsim.systematics import Effect, Library, Site, acts_through, seen_through, shared_gain, spread_of, variance_factor
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,7 @@ class SurveyMap:
     #: means over the samples of a pixel of g, the relative error of the gain, g (dtheta + i dphi), and g e^{-i s psi}
     #: for s from 1 to the orders of the beam, shape (orders + 2, npix); ``None``: no error
     gain: NDArray[np.complex128] | None = None
+    steady_gain: float = 0.0  #: relative error of the gain that all samples share
     #: mean of what effects add to the samples of a pixel, shape (npix,); ``None``: nothing
     signal_uk: NDArray[np.float64] | None = None
     preparation: Preparation | None = None  #: what is done to the map after it is made; ``None``: nothing
@@ -265,7 +266,8 @@ def _channel(
         m = with_effects(m, acting, site)
         part = Part.of(run, index)
         gain, signal_uk = gain_of_all(acting, site, part, beam.mmax), signal_of_all(acting, site, part)
-        maps.append(replace(m, gain=gain, signal_uk=signal_uk))
+        steady = shared_gain(acting, replace(site, split=split))
+        maps.append(replace(m, gain=gain, steady_gain=steady, signal_uk=signal_uk))
     # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
     spread = spread_of(acting)
     seen_window = window ** (spread * spread)
@@ -291,7 +293,8 @@ def _prepared(run: config.RunConfig, spec: config.Channel, channel: Channel) -> 
         moments = steps.moments(m.moments)
         noise = None if m.noise_uk is None else steps.noise_uk(m.noise_uk, m.moments.hits)
         weight = _weight(run, spec, split, m.name, moments, steps.weight())
-        maps.append(replace(m, moments=moments, noise_uk=noise, weight=weight, gain=None, signal_uk=None))
+        own = replace(m, moments=moments, noise_uk=noise, weight=weight)
+        maps.append(replace(own, gain=None, steady_gain=0.0, signal_uk=None))
     pixels, smoothing = steps.pixel_window(run.sky.lmax), steps.beam_window(run.sky.lmax)
     return replace(
         channel,

@@ -10,19 +10,22 @@ from mcsim.systematics.base import (
     Site,
     Wording,
     acts_through,
+)
+from mcsim.systematics.hooks import HookError, if_possible
+from mcsim.systematics.parametrization import Parametrization
+from mcsim.systematics.registry import Library, basis_of, build, called, catalogue, checked, effects, get, in_file
+from mcsim.systematics.together import (
     adding,
     disturbing,
     looked_at,
     reach,
     rescaling,
     seen_through,
+    shared_gain,
     spread_of,
     tried,
     variance_factor,
 )
-from mcsim.systematics.hooks import HookError, if_possible
-from mcsim.systematics.parametrization import Parametrization
-from mcsim.systematics.registry import Library, basis_of, build, called, catalogue, checked, effects, get, in_file
 
 __all__ = [
     "Alm",
@@ -52,6 +55,7 @@ __all__ = [
     "reach",
     "rescaling",
     "seen_through",
+    "shared_gain",
     "spread_of",
     "tried",
     "variance_factor",

@@ -6,7 +6,7 @@ maps and orientation moments) and the sample-by-sample one, so that an effect th
 a diagnosis, or acts in the time-ordered reference is one and the same.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal, Self
 
@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import LineOfSight, Moments, ScanModel
-from mcsim.sphere import alm as alm_
-from mcsim.sphere import rng
 from mcsim.support.numbers import measured
 from mcsim.systematics.hooks import guard
 from mcsim.systematics.parametrization import Parametrization, Vector
@@ -26,8 +24,6 @@ Alm = NDArray[np.complex128]
 Map = NDArray[np.float64]
 Draw = Callable[[str], np.random.Generator]
 """From the name of a stage to its stream of random numbers in this realization."""
-
-UNIFORM = 1e-9  #: relative departure of a beam from a multiple of another one that is round-off
 
 
 @dataclass(frozen=True)
@@ -57,6 +53,9 @@ class Site:
     whole: Callable[[], Beam] | None = None
     #: False: the map is one of a component separation, in which foregrounds are not looked for
     foregrounds: bool = True
+    #: splits, split: names of those of the survey, and whose samples are meant; None: all, and none where no split acts
+    splits: tuple[str, ...] = ()
+    split: str | None = None
 
     def pointed(self, effect: str) -> Pointing:
         """Return the pointing; raise InputError if it is not known."""
@@ -219,6 +218,10 @@ class Effect:
         """Return the relative error of the gain at times since the start, shape (n,); None: no error."""
         return None
 
+    def steady_gain(self, site: Site) -> float:
+        """Return the relative error of the gain that all samples of ``site.split`` share, whenever they were taken."""
+        return 0.0
+
     def signal(self, time_s: Vector, theta: Vector, phi: Vector, psi: Vector, site: Site) -> Vector:
         """Return what is added to samples at these times and fiducial pointings, uK, shape (n,)."""
         return np.zeros_like(time_s)
@@ -258,6 +261,11 @@ class Effect:
         return None
 
     # What people and configurations read.
+
+    @classmethod
+    def variants_in(cls, splits: Sequence[str]) -> tuple[Mapping[str, Any], ...]:
+        """Return the fixed parameters with which it is a candidate in a survey of these splits."""
+        return cls.variants
 
     def parameters(self) -> dict[str, Any]:
         """Return all parameters but the amplitude, by name."""
@@ -346,99 +354,3 @@ def acts_through(effect: Effect | type[Effect], *hooks: str) -> bool:
     """Return True if an effect, or the effects of a class, act through one of these hooks."""
     kind = effect if isinstance(effect, type) else type(effect)
     return any(getattr(kind, hook) is not getattr(Effect, hook) for hook in hooks)
-
-
-def seen_through(acting: Sequence[Effect], site: Site, displacing: Sequence[Effect] | None = None) -> Beam:
-    """Return the beam about the fiducial line of sight: every effect on its shape first, then all that displaces it.
-
-    ``displacing``: the effects that displace the line of sight; default: all.
-
-    Notes
-    -----
-    Effects on the shape act by rank, those of one rank in their order. Of those on the pointing what turns with the
-    beam comes first, then what moves samples, and the memory of earlier ones last, as in the sample-by-sample route.
-    """
-    beam = site.beam
-    for effect in sorted(acting, key=lambda one: one.rank):
-        beam = effect.beam(beam, site) if effect.amplitude != 0.0 else beam
-    for effect in sorted(acting if displacing is None else displacing, key=reach):
-        beam = effect.pointing(beam, site) if effect.amplitude != 0.0 else beam
-    return beam
-
-
-def reach(effect: Effect) -> int:
-    """Return 2 for an effect that mixes in signals of earlier samples, 1 for one that moves samples, 0 for others."""
-    if effect.lags() is not None:
-        return 2
-    return 0 if effect.moved(*np.zeros((3, 1))) is None else 1
-
-
-def rescaling(acting: Iterable[Effect], site: Site) -> float:
-    """Return the factor by which effects rescale all signal of a channel, of those that do nothing else to its beam."""
-    found, before = 1.0, site.beam.blm
-    for effect in acting:
-        after = effect.beam(site.beam, site).blm if effect.amplitude != 0.0 else before
-        if after is not before and after.shape == before.shape:
-            factor = float(np.vdot(before, after).real / np.vdot(before, before).real)
-            alike = np.linalg.norm(after - factor * before) <= UNIFORM * np.linalg.norm(after)
-            found *= factor if alike and factor > 0.0 else 1.0
-    return found
-
-
-def spread_of(acting: Iterable[Effect]) -> float:
-    """Return the factor by which the samples' offsets from the centre of their pixel shrink."""
-    return float(np.prod([effect.spread() for effect in acting]))
-
-
-def variance_factor(acting: Iterable[Effect], site: Site) -> Map | None:
-    """Return the factor of the variance of every pixel's samples, shape (npix,), >= 0; None: one."""
-    factors = [own for effect in acting if (own := effect.noise(site)) is not None]
-    return np.clip(np.prod(factors, axis=0), 0.0, None) if factors else None
-
-
-def adding(acting: Iterable[Effect]) -> list[Effect]:
-    """Return the effects that add a signal to samples."""
-    return [one for one in acting if one.amplitude != 0.0 and acts_through(one, "signal")]
-
-
-def disturbing(acting: Iterable[Effect]) -> list[tuple[Effect, str]]:
-    """Return the effects that add noise of their own to samples, with the names of their :func:`streams`."""
-    return [(one, own) for one, own in streams(acting) if one.amplitude != 0.0 and acts_through(one, "excess")]
-
-
-def tried(acting: Sequence[Effect], site: Site) -> Beam:
-    """Return the beam that effects make; raise InputError for one that cannot act in this channel."""
-    once = np.zeros(1)
-    looked_at(acting, np.zeros(alm_.size(site.lmax), dtype=np.complex128), site, 0, 0)
-    for effect in acting:
-        effect.gain(once, site)
-        effect.noise(site)
-        effect.knee(1.0)
-        effect.differencing(0.0, 0)
-    for effect in adding(acting):
-        site.pointed(effect.name)
-        effect.signal(once, once, once, once, site)
-    for effect, _ in disturbing(acting):
-        effect.excess(once, rng.generator(0, 0, "tried"))
-    return seen_through(acting, site)
-
-
-def looked_at(acting: Iterable[Effect], sky: Alm, site: Site, seed: int, realization: int) -> Alm:
-    """Return the sky that a channel looks at, uK: common effects come first, and draw alike in every channel."""
-    for effect, own in sorted(streams(acting), key=lambda one: one[0].scope == "channel"):
-        if effect.amplitude == 0.0:
-            continue
-
-        def draw(stage: str, own: str = own) -> np.random.Generator:
-            return rng.generator(seed, realization, f"{own}/{stage}")
-
-        sky = effect.sky(sky, site, draw)
-    return sky
-
-
-def streams(acting: Iterable[Effect]) -> Iterator[tuple[Effect, str]]:
-    """Yield effects with the names of their random streams: the second one of a name draws anew."""
-    met: dict[str, int] = {}
-    for effect in acting:
-        number = met[effect.name] = met.get(effect.name, 0) + 1
-        yield effect, f"effect/{effect.name}" if number == 1 else f"effect/{effect.name}/{number}"

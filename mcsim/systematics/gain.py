@@ -1,7 +1,8 @@
-"""Effects on the gain: constant, with the year, with the spin, with the signal."""
+"""Effects on the gain: constant, of one split, with the year, with the spin, with the signal."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -45,6 +46,47 @@ class Calibration(Effect):
 
     def inverse(self) -> Self:
         return replace(self, amplitude=reciprocal(self.amplitude))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitCalibration(Effect):
+    """Gain 1 + amplitude in one split of the survey alone, of sky and dipole alike; the noise stays as it is.
+
+    Attributes
+    ----------
+    amplitude
+        Fraction.
+    split
+        Name of the split.
+
+    Notes
+    -----
+    The dipole is subtracted with the fiducial gain, 1: amplitude times the dipole is left in the map of the split.
+    """
+
+    name = "split_calibration"
+    scope = "channel"
+    unit = "fraction"
+    title = "calibration of one split"
+    wording = Wording("{} of the gain", " %", 100.0)
+    cause = "Parts of a survey that were calibrated one by one, such as years or sets of detectors."
+    signature = "The same factor of sky and dipole at all degrees, in one split and in no other of the channel."
+    source = "Jarosik et al. 2011, ApJS 192, 14 (gain of every year); Planck 2015 results VIII, A&A 594, A8 (of rings)"
+    step = 1e-3
+    bounds = (Bound("amplitude", -0.5, 0.5, "a prior of this library: half of the dipole is seen by eye"),)
+    proposed = False
+
+    split: str = ""
+
+    @classmethod
+    def variants_in(cls, splits: Sequence[str]) -> tuple[Mapping[str, Any], ...]:
+        return tuple({"split": name} for name in splits) if len(splits) > 1 else cls.variants
+
+    def steady_gain(self, site: Site) -> float:
+        if self.split not in site.splits:
+            known = f"choose from {', '.join(site.splits)}" if site.splits else "name the splits in map.splits"
+            raise InputError(f"effect {self.name}: split = {self.split!r} is no split of {site.channel}; {known}.")
+        return self.amplitude if site.split == self.split else 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments
 
 HOOKS = (
-    *("sky", "beam", "pointing", "gain", "signal", "noise", "knee", "excess"),
+    *("sky", "beam", "pointing", "gain", "steady_gain", "signal", "noise", "knee", "excess"),
     *("spread", "orientations", "differencing", "moved", "lags"),
 )
 
@@ -21,6 +21,7 @@ _RETURNED = {
     "beam": "a mcsim.Beam",
     "pointing": "a mcsim.Beam",
     "gain": "one real value for each of the times",
+    "steady_gain": "a number",
     "signal": "one real value for each of the times",
     "noise": "one real value for each pixel",
     "knee": "a frequency",
@@ -107,7 +108,7 @@ def _shape(hook: str, values: np.ndarray, given: Sequence[Any]) -> tuple[int, ..
     match hook:
         case "noise":
             return (12 * given[0].nside ** 2,)
-        case "spread" | "knee":
+        case "spread" | "knee" | "steady_gain":
             return ()
         case "differencing":
             return (2,)

@@ -29,6 +29,7 @@ SIGNATURES = {
     "beam_sidelobe": Signature("", (0, 1, 2)),
     "beam_width": Signature("", (0,), "even"),
     "calibration": Signature("", (0, 1), "even"),
+    "split_calibration": Signature("", (0, 1), "even"),
     "beam_noncircularity": Signature("ecliptic", (1, 2, 3, 4)),
     "pointing_offset": Signature("ecliptic", (1,)),
     "time_constant": Signature("ecliptic", (1, 2)),

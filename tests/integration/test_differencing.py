@@ -276,6 +276,9 @@ def test_noise_and_signals_of_samples_of_one_beam_are_refused(year):
     for name in ("excess_noise", "orbital_dipole", "gain_spin"):
         with refused(name, "W1"):
             survey(year(effect=[{"name": name, "channel": "W1", "amplitude": 0.1}]))
+    split = {"name": "split_calibration", "channel": "W1", "amplitude": 0.1, "split": "b"}
+    with refused("split_calibration", "W1", "differences"):
+        survey(year(effect=[split], map={"nside": NSIDE, "splits": ["a", "b"]}))
 
 
 def test_survey_of_another_scan_has_no_side_b():

@@ -115,6 +115,32 @@ def test_a_steady_gain_is_a_calibration(changes):
     assert np.abs(steady - calibrated).max() < 1e-9
 
 
+OF_SPLIT = {"name": "split_calibration", "amplitude": 0.05, "split": "b"}
+CALIBRATED = {"name": "calibration", "amplitude": 0.05}
+
+
+@pytest.mark.parametrize("changes", [{}, {"split_by": "rings"}, {"pixel_window": "none"}, {"offset_order": 0}], ids=str)
+def test_a_calibration_of_one_split_is_that_of_all_in_its_map(changes):
+    """In both routes, beside an offset, a coma, and samples that are nearer to the centres of their pixels."""
+    beside = (OFF, LOPSIDED, {"name": "pixelization", "amplitude": 0.5})
+    bare, of_split, of_all = [
+        prepared(*beside, *more, splits=["a", "b"], **changes) for more in ((), (OF_SPLIT,), (CALIBRATED,))
+    ]
+    for route, tolerance in ((simulate.maps, 1e-9), (lambda one, k: [m for _, m in sampled.maps(one, k)], 1e-3)):
+        first, second = route(of_split, 0)
+        assert np.abs(first - route(bare, 0)[0]).max() < 1e-12
+        assert np.abs(second - route(of_all, 0)[1]).max() < tolerance
+        assert np.std(second - route(bare, 0)[1]) > 50.0
+
+
+def test_gains_of_one_split_and_of_the_year_add():
+    both, yearly, alone, bare = (
+        simulate.maps(prepared(LOPSIDED, *more, splits=["a", "b"]), 0)[1]
+        for more in ((YEARLY, OF_SPLIT), (YEARLY,), (OF_SPLIT,), ())
+    )
+    assert np.abs(both - yearly - alone + bare).max() < 1e-9
+
+
 def test_a_gain_multiplies_what_a_displaced_beam_sees():
     """What an offset of two degrees adds is of the orders m > 0: 1.3 uK of 20 were missing. Pixels leave 0.013."""
     default, reference = responses((YEARLY,), beside=(OFF,))

@@ -21,6 +21,7 @@ LMAX, NSIDE = 48, 8
 ON_REQUEST = {
     "sidelobe_pickup",
     "gain_spin",
+    "split_calibration",
     "bandpass_mismatch",
     "nonlinearity",
     "orbital_dipole",

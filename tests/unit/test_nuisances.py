@@ -53,6 +53,7 @@ MANY = (
     },
     {"effect": "point_sources", "width": 0.01},
 )
+IN_B = {"effect": "split_calibration", "channel": "V1", "width": 0.003, "parameters": {"split": "b"}}
 STEPS = [{"kind": "smooth", "fwhm_arcmin": 1200.0}, {"kind": "subtract_dipole"}]
 
 
@@ -70,7 +71,7 @@ def test_maps_of_rings_have_the_drift_of_their_own():
 
 @pytest.mark.parametrize("preparation", [[], STEPS], ids=["plain", "prepared"])
 def test_a_disturbed_survey_is_that_of_a_run_with_the_effects_that_are_drawn(preparation):
-    run = model(*MANY, preparation=preparation)
+    run = model(*MANY, IN_B, preparation=preparation)
     own = {"name": "gain_drift", "channel": "W1", "amplitude": 0.003}
     run = config.load(config.to_dict(run) | {"effect": [own]})
     disturbed = DisturbedSurvey.of(run)

@@ -175,6 +175,20 @@ def in_half_and_both(stage, acts_on, kind):
     return [w for w in every if (w.stage, w.acts_on, w.kind) == (stage, acts_on, kind) and w.frame != SUN]
 
 
+def test_a_gain_of_one_half_needs_no_pointing():
+    """It acts on sky and dipole alike: on the sky alone only where there is no dipole."""
+    scene, theta = replace(seen()[1], elsewhere=()), np.array([1e-3])
+    alike, of_sky = (in_half_and_both("gain", on, "constant")[0] for on in ("sky and dipole", "sky"))
+    made = plugin("unlisted_1", alike, theta, scene)
+    assert made == plugin("unlisted_1", of_sky, theta, replace(scene, dipole_uk=np.zeros(3)))
+    assert plugin("unlisted_1", of_sky, theta, scene) is None
+    site = survey(seen()[0]).channels[1].site
+    errors = [made.kind()(amplitude=2.0).steady_gain(replace(site, split=split)) for split in scene.splits]
+    assert errors == pytest.approx([0.0, 2e-3 / np.sqrt(4.0 * np.pi)])
+    with refused("half1", "half2", "none"):
+        made.kind()(amplitude=2.0).steady_gain(replace(site, splits=()))
+
+
 @pytest.mark.parametrize(
     ("stage", "acts_on"), [("rotation", "sky and dipole"), ("square", "sky"), ("cube", "sky and dipole")]
 )
