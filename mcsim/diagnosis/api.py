@@ -124,7 +124,7 @@ def diagnose(
             if source is not None:
                 campaign.check_data(found.x, ensemble, source)
             diagnosis = diagnose_data(found, str(case or run.name))
-        if diagnosis.kind == "unknown" and isinstance(found, ObservedMaps) and source is None:
+        if diagnosis.kind == "unknown" and isinstance(found, ObservedMaps) and source is None and not diagnosis.orders:
             with asking(call, quiet, simulated_scores.scores, "simulations of what is not listed") as ask:
                 diagnosis = unlisted.reconstructed(diagnosis, found, ask)
     if means:

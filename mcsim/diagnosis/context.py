@@ -16,7 +16,6 @@ from mcsim.datavector.localisation import Place
 from mcsim.datavector.nuisances import with_nuisances
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.diagnosis.selection import Attribution
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
 from mcsim.support.arrays import Matrix, Vector
@@ -189,8 +188,9 @@ class DataSet(ABC, Generic[Data]):
         """Return the templates for these data, shape (p, K)."""
         return self.context.templates
 
-    def exchanged(self, found: Attribution) -> list[str]:
-        """Return sentences on orders of the maps in which the model fits better than any effect explains."""
+    @property
+    def exchanged(self) -> list[str]:
+        """Return sentences on orders of the maps in which the model fits, if it does not in that of the data."""
         return []
 
     def notes(self) -> list[str]:

@@ -32,16 +32,23 @@ from mcsim.stats.scattered import with_drawn_scatter, with_scatter, with_tangent
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.numbers import measured
 
+EXPLAINED = 0.5  #: share of the excess chi^2 that a single effect explains which is more likely than an exchange
+
 
 def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     """Diagnose observed maps or measured spectra; raise InputError if they cannot be what they claim to be."""
-    context, t = data.context, data.templates()
+    context = data.context
+    if _is_out_of_order(data, first := Refiner(data).unrefined(context.templates)):
+        first = replace(first, attribution=first.attribution.unexplained())
+        return replace(result_of(data, case, first, None, data.notes()), orders=tuple(data.exchanged))
+    t = data.templates()
     start = bent_templates(context.null, data.x, t, context.bank.curvature, context.candidates)
     refined = Refiner(data).run(t, context.candidates, start=start)
     data, refined = with_found_noise(data, refined)
     found, reduction = refined.attribution.if_named(data.context.settings), None
-    exchanged = data.exchanged(found)
-    notes, refusals = [*exchanged, *in_words(data.context), *data.notes()], list[str]()
+    # An order of the maps in which the model fits says more than any effects, but for a single one.
+    exchanged = [] if found.explanations and len(found.explanations[0].members) == 1 else data.exchanged
+    notes, refusals = [*in_words(data.context), *data.notes()], list[str]()
     if not exchanged and found.explanations:
         found, refusals = agreeing(data, refined, found)
         if (beside := with_rivals(data, refined, found)) is not None:
@@ -49,7 +56,6 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
             found, refusals = agreeing(data, refined, refined.attribution.if_named(data.context.settings))
     context, detected = data.context, refined.partial
     if exchanged:
-        # An order of the maps in which the model fits says more than any effect.
         found, detected = found.unexplained(), None
     elif found.explanations:
         found = _with_errors(data, refined, found)
@@ -64,7 +70,15 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     notes += refusals
     for own in found.explanations[:1] if detected is None else [detected]:
         notes += as_seen(context, own.members, own.fit)
-    return result_of(data, case, replace(refined, attribution=found, partial=detected), reduction, notes)
+    refined = replace(refined, attribution=found, partial=detected)
+    return replace(result_of(data, case, refined, reduction, notes), orders=tuple(exchanged))
+
+
+def _is_out_of_order(data: DataSet[Any], first: Refined) -> bool:
+    """Return True if the model fits the maps in another order, and no effect alone explains much as they are."""
+    gap = first.attribution.gap
+    most = max((fit.delta_chi2 for fit in first.attribution.singles), default=0.0)
+    return most < EXPLAINED * (gap.chi2 - gap.dimension) and bool(data.exchanged)
 
 
 def confirmed(

@@ -15,7 +15,6 @@ from mcsim.datavector.map_checks import exchanges, share_left_out
 from mcsim.datavector.nuisances import half_given_other
 from mcsim.datavector.same_skies import SameSkies, Skies
 from mcsim.diagnosis.context import DataSet
-from mcsim.diagnosis.selection import Attribution
 from mcsim.support.arrays import Map, Matrix, Vector
 from mcsim.systematics import if_possible
 
@@ -148,10 +147,11 @@ class ObservedMaps(DataSet[Sequence[Map]]):
                 changes = [self.same_skies.odd([table], skies).mean(axis=0) for table in each]
                 yield one, np.stack(changes, axis=1) / one.steps
 
-    def exchanged(self, found: Attribution) -> list[str]:
-        """Return orders of maps or pixels in which the model fits, unless it fits as they are or one effect does."""
+    @cached_property
+    def exchanged(self) -> list[str]:
+        """Return sentences on orders of maps or pixels in which the model fits, if it does not as they are."""
         context, level = self.context, self.context.settings.exchanged_pvalue
-        if found.gap.omnibus > level or (found.explanations and len(found.explanations[0].members) == 1):
+        if self.gap.omnibus > level:
             return []
         parts, notes = context.analysis.model.parts, []
 

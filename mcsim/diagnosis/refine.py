@@ -77,6 +77,11 @@ class Refiner:
         """Return the model, its simulations and templates."""
         return self.data.context
 
+    def unrefined(self, t: Matrix) -> Refined:
+        """Return the attribution by templates, shape (p, K), without any simulation."""
+        candidates = self.context.candidates
+        return Refined(self._attribute(t, candidates), t, candidates, t)
+
     def run(
         self,
         t: Matrix,

@@ -188,6 +188,8 @@ class DiagnosisResult:
     unlisted, unlisted_held_out
         After an unknown gap, what is missing, the most evident structure first; and the reduction of the excess on
         held-out data by all of it. None: not looked for, not measured.
+    orders
+        Orders of maps or pixels in which the model fits, a sentence on each: all that is said of an unknown gap then.
     untested
         Elements that are not tested, in words: they follow the square of a nuisance as wide as its prior.
     """
@@ -231,6 +233,7 @@ class DiagnosisResult:
     unlisted_held_out: HeldOut | None = None
     untested: tuple[str, ...] = ()
     nearest_pvalue: float | None = None
+    orders: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> dict[str, Any]:
@@ -300,7 +303,7 @@ class DiagnosisResult:
                 for one in self.candidates
                 if one.detectable is not None
             ],
-            "notes": list(self.notes),
+            "notes": [*self.orders, *self.notes],
             **({} if self.unlisted is None else {"unlisted": [one.to_json() for one in self.unlisted]}),
             **({} if self.unlisted_held_out is None else {"unlisted_shrink": self.unlisted_held_out.to_json()}),
             **({"untested": list(self.untested)} if self.untested else {}),

@@ -29,6 +29,8 @@ def sentence(result: DiagnosisResult) -> str:
     start = f"The model does not describe the data ({p})"
     if result.faint:
         return f"{start}, but the departure is too faint to name its cause."
+    if result.orders:
+        return f"{start}. {' '.join(result.orders)}"
     if result.kind == "unknown":
         partly = ""
         if len(result.partial) > 1 and result.partial_left is not None:
@@ -75,6 +77,8 @@ def status(result: DiagnosisResult) -> str:
             rest = f"But one group of numbers does by itself: {place.element.words} (z = {place.z:.1f}, "
             rest += f"{p_equals(place.p)}, look-elsewhere effect included)."
         return f"Neither χ² nor any candidate departs from the simulations. {rest}"
+    if result.orders:
+        return " ".join(result.orders)
     near = result.candidates[result.nearest]
     if result.faint:
         return (

@@ -402,12 +402,17 @@ def test_maps_by_the_default_route_have_the_mean_of_the_simulations(small):
 def test_maps_of_another_order_are_noticed(small):
     """Of pixels, where a file does not say that it is NESTED, and of splits."""
     maps = list(simulate.maps(data_of(small.run), 0))
-    gap = SimpleNamespace(gap=SimpleNamespace(omnibus=0.0), explanations=())
 
     def notes(observed):
-        return " ".join(ObservedMaps(small, observed, ask).exchanged(gap))
+        return " ".join(ObservedMaps(small, observed, ask).exchanged)
 
-    assert "NESTED" in notes([healpy.reorder(one, r2n=True) for one in maps])
+    nested = [healpy.reorder(one, r2n=True) for one in maps]
+    assert "NESTED" in notes(nested)
+    found = diagnose_data(ObservedMaps(small, nested, lambda jobs: pytest.fail("nothing is simulated")), "nested")
+    assert found.kind == "unknown"
+    assert "NESTED" in found.orders[0]
+    assert found.verdict["notes"][0] == found.orders[0]
+    assert found.orders[0] in words.sentence(found)
     assert "V1:half1 as V1:half2" in notes([maps[i] for i in (1, 0, 3, 2)])
     assert "NESTED" not in notes(maps)
     # What is left out is filled, and departs from no model.
