@@ -77,7 +77,8 @@ class DiagnosisSettings:
         Global p-value of the comparisons of an effect's amplitude in independent parts of the data, and of what it
         leaves in them, up to which it is not named.
     absence_odds
-        Odds of no effect against it, in the data without the part that supports it most, from which on it is not named.
+        Odds of no effect against it, in the data without the part that supports it most, over the number of comparisons
+        that tell such odds, from which on it is not named.
     consistency_error
         Relative error of an effect's response in these parts that is tolerated.
     compared_sets

@@ -73,8 +73,12 @@ class Findings:
 
     @property
     def odds(self) -> float:
-        """Return the largest odds of no effect against one of the effects, in the data without one part."""
-        return max((one.odds for own in self.comparisons for one in own), default=1.0)
+        """Return the largest odds of no effect against one of the effects, in the data without one part.
+
+        They are over the number of comparisons that tell such odds, each of which has the chance of them.
+        """
+        each = [one.odds for own in self.comparisons for one in own if len(one.slices) > 1]
+        return max(each) / len(each) if each else 1.0
 
     @property
     def bound(self) -> float:
