@@ -103,6 +103,7 @@ class Measurement:
     simulations: int | None
     realizations: NDArray[np.float64] | None = None  #: data vectors of the realizations, shape (N, p), if known
     highest: int | None = None  #: highest degree of the maps of the data; ``None``: not known, that of the model
+    count: int = 1  #: number of realizations whose mean the data are
 
     @property
     def of_one_map(self) -> bool:
@@ -179,7 +180,7 @@ def from_store(path: str | Path, selection: Selection = EVERYTHING) -> Measureme
         raise InputError(f"{path} has no {min(absent).name} for the pair {label} at these ell; leave the mode out.")
     drawn = drawn[:, measured]
     value, covariance = drawn.mean(axis=0), _covariance(drawn) / len(drawn)
-    return Measurement(str(path), label, chosen, kept, SUMMARY, value, covariance, len(drawn), drawn, lmax)
+    return Measurement(str(path), label, chosen, kept, SUMMARY, value, covariance, len(drawn), drawn, lmax, len(drawn))
 
 
 def refuse_filtered(path: str | Path, name: str) -> None:
@@ -192,7 +193,7 @@ def refuse_filtered(path: str | Path, name: str) -> None:
 
 
 def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None = None) -> Measurement:
-    """Return the data of a measurement with the covariance of one realization of an ensemble that models it.
+    """Return the data of a measurement with the covariance of an ensemble that models it, that of a mean of as many.
 
     The measurement is usually from a table, whose own errors are not used. ``pair`` is a label of the store; by default
     that of the measurement, or the store's first of one map, or of two, as it is. InputError if the store lacks such a
@@ -207,7 +208,7 @@ def with_covariance_of(measured: Measurement, path: str | Path, pair: str | None
         raise InputError(f"{path} has no pair of {kind}, as the data are; give a store that has, or name a pair of it.")
     label = pair or (measured.pair if measured.pair in labels else alike[0])
     drawn = realizations(path, measured.rows, measured.scaling, measured.kind, label, measured.highest)
-    return replace(measured, covariance=_covariance(drawn), simulations=len(drawn))
+    return replace(measured, covariance=_covariance(drawn) / measured.count, simulations=len(drawn))
 
 
 def _covariance(drawn: NDArray[np.float64]) -> NDArray[np.float64]:

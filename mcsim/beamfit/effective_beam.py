@@ -247,9 +247,9 @@ def measurement(
     ``data``: a store (a folder): its mean, with the covariance of its realizations over their number; an ECSV table; or
     a measurement, which has its selection.
     ``source``, ``selection``: configuration, whose frame the data must have, and the modes, multipoles, kind and pair
-    that are fitted. ``covariance``: store that models the data: the covariance of one of its realizations replaces that
-    of the data. Raise InputError for data that cannot be read or lack what is selected, and for data or a covariance in
-    another frame than the configuration, or of filtered maps.
+    that are fitted. ``covariance``: store that models the data, whose covariance, over the number of realizations that
+    the data are the mean of, replaces that of the data. Raise InputError for data that cannot be read or lack what is
+    selected, and for data or a covariance in another frame than the configuration, or of filtered maps.
     """
     if isinstance(data, Measurement):
         if selection != EVERYTHING:

@@ -17,6 +17,7 @@ from mcsim.bipolar import Mode
 from mcsim.errors import InputError
 from mcsim.support.folders import unreadable
 
+SPARE = 3  #: realizations beyond the bins that a fit with their covariance needs
 COLUMNS = ("L", "M", "d", "ell_min", "ell_max")  #: columns that identify the content of a row
 
 
@@ -29,7 +30,8 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
     highest degree of the maps (default: of the configuration). ``mcsim info --export`` writes such tables, with a
     column ``pair`` and, for paired ensembles, ``value_difference`` and so on.
     ``errors`` False: those of the table do not count, and are one each.
-    Raise InputError for a table that cannot be read, or does not define its numbers.
+    Raise InputError for a table that cannot be read, does not define its numbers, or has the errors of fewer
+    ``realizations`` (in its meta) than a fit takes from a store.
     """
     table = read_ecsv(path)
     refuse_filtered(path, str(table.meta.get("filter", "none")))
@@ -70,8 +72,10 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
     if len(set(rows)) < len(rows):
         raise InputError(f"{path} gives a bin of one mode twice; keep one row of each.")
     _check_modes(path, selection, rows, label)
+    count = count_of(path, table.meta)
     if errors:
         _warn_of_overlaps(path, rows)
+        _check_count(path, count, len(rows))
     value = np.concatenate(values)
     sigma = np.concatenate(sigmas) if errors else np.ones_like(value)
     bad = np.flatnonzero(~(np.isfinite(value) & np.isfinite(sigma) & (sigma > 0.0)))
@@ -87,7 +91,9 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
             f"{sigma[bad[0]]:g}; {remedy}."
         )
     covariance, highest = np.diag(sigma**2), highest_of(path, table.meta)
-    return Measurement(str(path), label, chosen, tuple(rows), scaling, value, covariance, None, highest=highest)
+    return Measurement(
+        str(path), label, chosen, tuple(rows), scaling, value, covariance, None, highest=highest, count=count
+    )
 
 
 def _check_modes(path: str | Path, selection: Selection, rows: list[Row], label: str | None) -> None:
@@ -115,6 +121,29 @@ def _warn_of_overlaps(path: str | Path, rows: Sequence[Row]) -> None:
                 stacklevel=5,
             )
             return
+
+
+def _check_count(path: str | Path, count: int, rows: int) -> None:
+    """Refuse errors of a mean of few realizations; warn of what a table of one does not have."""
+    instead = "fit the store, or take the covariance of one (--covariance)"
+    if 1 < count < rows + SPARE:
+        raise InputError(
+            f"{path} has errors of {count} realizations, too few for {rows} bins without their correlations; {instead}."
+        )
+    if count > 1:
+        warnings.warn(
+            f"{path} has errors of {count} realizations without their correlations: bins are taken for independent, "
+            f"with known errors; {instead}.",
+            stacklevel=4,
+        )
+
+
+def count_of(path: str | Path, meta: Any) -> int:
+    """Read from the header of a table of how many realizations it is the mean; InputError for no such number."""
+    count = meta.get("realizations", 1)
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise InputError(f"{path} is the mean of {count!r} realizations; give a whole number from 1 in its meta.")
+    return count
 
 
 def check_frame(path: str | Path, found: str, wanted: str) -> None:

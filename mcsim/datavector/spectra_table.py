@@ -10,7 +10,16 @@ import numpy as np
 
 from mcsim import config
 from mcsim.beamfit.data import Row, Scaling, project
-from mcsim.beamfit.table import check_frame, check_parity, highest_of, identified, in_uk2, read_ecsv, scaling_of
+from mcsim.beamfit.table import (
+    check_frame,
+    check_parity,
+    count_of,
+    highest_of,
+    identified,
+    in_uk2,
+    read_ecsv,
+    scaling_of,
+)
 from mcsim.bipolar import Mode
 from mcsim.bipolar.modes import existing
 from mcsim.datavector.analysis import Analysis, Job, analysis_of, kinds_of, surveys
@@ -145,10 +154,7 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
     if not said and any(row.mode.L for row in rows):
         raise InputError(f'{path} does not say its frame; add frame: "{frame}" to its meta, if that is the one.')
     check_frame(path, said or frame, frame)
-    count = table.meta.get("realizations", 1)
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise InputError(f"{path} is the mean of {count!r} realizations; give a whole number from 1 in its meta.")
-    return Spectra(str(path), frame, rows, pairs, scaling, value, error, count, highest)
+    return Spectra(str(path), frame, rows, pairs, scaling, value, error, count_of(path, table.meta), highest)
 
 
 def _pairs(run: config.RunConfig) -> dict[str, Pair]:

@@ -99,6 +99,8 @@ def test_covariances_of_two_maps_are_those_of_such_a_pair(tmp_path):
     store = mcsim.run(run, tmp_path / "all.zarr").store
     measured = from_store(store, Selection(modes=["L2M0d0"], pair="W1:half1,W1:half2"))
     own = with_covariance_of(measured, store).covariance
+    np.testing.assert_allclose(own, measured.covariance)  # of a mean of as many
+    np.testing.assert_allclose(with_covariance_of(replace(measured, count=1), store).covariance, measured.count * own)
     np.testing.assert_array_equal(with_covariance_of(replace(measured, pair="A,B"), store).covariance, own)
     alone = mcsim.run(run | {"biposh": biposh | {"pairs": "auto"}}, tmp_path / "auto.zarr").store
     with refused("auto.zarr"):

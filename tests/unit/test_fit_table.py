@@ -53,6 +53,17 @@ def test_the_header_says_where_the_maps_end(tmp_path):
         read(tmp_path, table(META | {"lmax": 40.5}))
 
 
+def test_errors_of_few_realizations_are_no_known_errors(tmp_path):
+    """They scatter, and a table lacks their correlations: the pulls of a fit to 5 skies had an rms of 2."""
+    with refused("table.ecsv", 5, 3, "--covariance"):
+        read(tmp_path, table(META | {"realizations": 5}))
+    with pytest.warns(UserWarning, match="6 realizations"):
+        assert read(tmp_path, table(META | {"realizations": 6})).count == 6
+    assert read(tmp_path, table()).count == 1
+    with refused("table.ecsv", "few"):
+        read(tmp_path, table(META | {"realizations": "few"}))
+
+
 def test_units_are_converted(tmp_path):
     np.testing.assert_allclose(read(tmp_path, table(unit="mK2")).value, [1e6, 2e6, 3e6])
 
