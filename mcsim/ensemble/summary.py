@@ -79,7 +79,6 @@ def reduce_rows(layout: Layout, rows: Mapping[str, NDArray]) -> Sums | None:
         if layout.paired:
             for name in [name for name in ("biposh", "cl", QML, SCORE) if name in values]:
                 values[f"{name}_difference"] = values[name] - values[f"{name}_circular"]
-        values = {name: x for name, x in values.items() if not name.startswith(SCORE) or name.endswith("difference")}
         wide = [name for name in values if name.startswith("biposh") and not name.startswith(QML)]
         bins = {f"{name}_binned": binned(layout, values[name]) for name in wide}
         estimates = [name for name in values if name.startswith(QML) and not name.startswith(SCORE)]
@@ -88,23 +87,26 @@ def reduce_rows(layout: Layout, rows: Mapping[str, NDArray]) -> Sums | None:
     return streaming.tree(node, len(rows["done"]))
 
 
-def of_normalisation(layout: Layout, sums: Sums, probes: int) -> NDArray[np.float64]:
-    """Return the error of the mean difference of filtered estimates that all realizations share, (pair, mode, bin).
+def of_normalisation(layout: Layout, sums: Sums, probes: int, kind: str) -> NDArray[np.float64]:
+    """Return the error of the mean of filtered estimates that all realizations share, (pair, mode, bin).
 
     It is that of the estimate of F by random probes, uK^2: zero without probes, or in stores that do not have the
-    scores F alpha.
+    scores F alpha. ``kind``: "", "_circular" or "_difference".
 
     Notes
     -----
-    The variances of numbers for one isotropic sky, the diagonal of F^-1, are those of the controls over realizations.
+    The variances of numbers for one isotropic sky, the diagonal of F^-1, are those of the controls over realizations,
+    or, without controls, of the estimates themselves. Plain means, and those of controls, hold the power of the sky and
+    the mean field, so that this error of theirs is far larger than that of their difference.
     """
-    found = np.zeros(sums.mean[f"{QML}_difference"].shape)
-    if not probes or f"{SCORE}_difference" not in sums.mean:
+    found = np.zeros(sums.mean[f"{QML}{kind}"].shape)
+    if not probes or f"{SCORE}{kind}" not in sums.mean:
         return found
     parts = np.where([mode.M > 0 for mode in layout.modes], 2, 1)[:, None]
-    variances = streaming.standard_deviation(sums, f"{QML}_circular") ** 2
+    isotropic = f"{QML}_circular" if layout.paired else QML
+    variances = streaming.standard_deviation(sums, isotropic) ** 2
     for row, label, numbers, score, variance in zip(
-        found, layout.pairs, sums.mean[f"{QML}_difference"], sums.mean[f"{SCORE}_difference"], variances, strict=True
+        found, layout.pairs, sums.mean[f"{QML}{kind}"], sums.mean[f"{SCORE}{kind}"], variances, strict=True
     ):
         x, _, y = label.partition(",")
         size = int(np.sum(parts * np.isfinite(numbers)))
@@ -144,8 +146,8 @@ def dataset(layout: Layout, sums: Sums, attributes: Mapping[str, Any]) -> "xr.Da
             meaning = f"l(l+1)/2pi A, mean over the bin, {meaning}"
         deviation = streaming.standard_deviation(sums, name)
         error, of_mean = deviation / np.sqrt(sums.count), "standard error of the mean"
-        if name == f"{QML}_difference":
-            error = np.hypot(error, of_normalisation(layout, sums, attributes.get("probes", 0)))
+        if raw.startswith(QML):
+            error = np.hypot(error, of_normalisation(layout, sums, attributes.get("probes", 0), kind))
             of_mean += ", that of the normalisation by random probes included"
         for suffix, array, text in (
             ("mean", sums.mean[name], "mean"),

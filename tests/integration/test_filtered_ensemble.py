@@ -62,14 +62,17 @@ def test_store_has_what_a_realization_gives_and_says_what_it_is(table, store: Pa
         np.testing.assert_allclose(found.biposh_qml_mean.values, mean, rtol=1e-10)
 
 
-def test_errors_of_differences_have_that_of_their_normalisation(table, store: Path) -> None:
-    """With 24 probes it is as large as the scatter of 12 realizations: as F itself has it, and in quadrature."""
+@pytest.mark.parametrize("kind", ["", "_circular", "_difference"])
+def test_errors_of_means_have_that_of_their_normalisation(table, store: Path, kind: str) -> None:
+    """As F itself has it, in quadrature: with 24 probes as large as the scatter of 12 differences, larger of powers."""
     filtering = survey(config.load(table)).filtering
     assert filtering is not None
     with open_ensemble(store) as stored, open_summary(store) as found:
-        scores = (stored.biposh_qml_score - stored.biposh_qml_score_circular).mean("realization").values
-        means, errors = (found[f"biposh_qml_difference_{name}"].values for name in ("mean", "standard_error"))
-        scatters = found.biposh_qml_difference_standard_deviation.values / np.sqrt(REALIZATIONS)
+        every = {name: stored[f"biposh_qml_score{name}"] for name in ("", "_circular")}
+        every["_difference"] = every[""] - every["_circular"]
+        scores = every[kind].mean("realization").values
+        means, errors = (found[f"biposh_qml{kind}_{name}"].values for name in ("mean", "standard_error"))
+        scatters = found[f"biposh_qml{kind}_standard_deviation"].values / np.sqrt(REALIZATIONS)
         variances = found.biposh_qml_circular_standard_deviation.values**2
     for row, (bands, (x, y), (matrix, unbiased)) in enumerate(
         zip(filtering.bands, filtering.pairs, filtering.fisher(), strict=True)
@@ -83,7 +86,8 @@ def test_errors_of_differences_have_that_of_their_normalisation(table, store: Pa
         total, pairs = float(alpha @ matrix @ alpha) / unbiased, 24 * 23 / (2.0 if x == y else 1.0)
         shared = inverse_variance(variances[row], np.abs(means[row]) ** 2, total, bands.size, pairs)
         np.testing.assert_allclose(errors[row], np.sqrt(scatters[row] ** 2 + shared), rtol=1e-8)
-        assert 0.5 < np.sqrt(np.nanmean(shared) / np.nanmean(scatters[row] ** 2)) < 5.0
+        ratio = np.sqrt(np.nanmean(shared) / np.nanmean(scatters[row] ** 2))
+        assert 0.5 < ratio < 5.0 if kind == "_difference" else ratio > 1.0
 
 
 def test_slices_and_resumption_give_the_same_bits(table, client: Client, store: Path, tmp_path: Path) -> None:
