@@ -1,6 +1,7 @@
 """Texts about a store and about a prediction."""
 
 from pathlib import Path
+from statistics import NormalDist
 
 import numpy as np
 import xarray as xr
@@ -44,13 +45,21 @@ def describe(path: str | Path) -> str:
         kind = "_difference" if paired else ""
         names = [f"biposh{kind}_binned_{what}" for what in ("mean", "standard_error")]
         with opening.open_summary(target) as summary:
-            rows = list(strongest(opening.read_in(summary[names], target), kind).head(5).itertuples())
-        what = "mean of the difference to the control over its error" if paired else "mean over error"
-        found += [f"  strongest binned spectra ({what}):"] if rows else []
+            known = opening.read_in(summary[[*names, "count"]], target)
+            looked_at = int((spectra(known, kind)["sigma"] > 0.0).sum())
+            rows = list(strongest(known, kind).head(5).itertuples())
+        what = "mean of the difference to the control" if paired else "mean"
+        chance = f"the largest of {looked_at} by chance: about {_of_chance(looked_at):.1f} sigma"
+        found += [f"  strongest binned spectra ({what}; {chance}):"] if rows else []
         for row in rows:
             bounds = f"l = {row.bin_first}-{row.bin_last}"
             found.append(f"    {row.pair}  {row.mode:8s} {bounds:14s} {_value(row.value)} uK^2, {row.sigma:.1f} sigma")
     return "\n".join(found)
+
+
+def _of_chance(number: int) -> float:
+    """Return the median of the largest of as many absolute normal deviates."""
+    return -NormalDist().inv_cdf(-0.5 * float(np.expm1(np.log(0.5) / number)))
 
 
 def describe_prediction(prediction: xr.Dataset) -> str:

@@ -23,12 +23,18 @@ TABLES = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}  #: astro
 def spectra(summary: xr.Dataset, kind: str) -> pd.DataFrame:
     """Return the bins of all spectra with L > 0: pair, mode, bin_first, bin_last, value and error in uK^2, sigma.
 
-    ``kind``: "" for the plain mean, "_difference" for that to the circular-beam control. ``sigma`` is |value| / error.
+    ``kind``: "" for the plain mean, "_difference" for that to the circular-beam control. ``sigma`` is |value| / error;
+    of a mean of realizations (``count``) the normal deviate that is as improbable without a mean.
     """
     names = {f"biposh{kind}_binned_mean": "value", f"biposh{kind}_binned_standard_error": "error"}
     chosen = summary[list(names)].isel(mode=np.flatnonzero(summary["L"] > 0)).rename(names)
     rows = chosen.to_dataframe(dim_order=["pair", "mode", "bin"]).reset_index()
-    return rows.assign(sigma=(rows["value"].abs() / rows["error"].where(rows["error"] > 0)).fillna(0.0))
+    ratio = (rows["value"].abs() / rows["error"].where(rows["error"] > 0)).fillna(0.0)
+    if "count" in summary:
+        from mcsim.stats.look_elsewhere import deviates_of_means  # the numerics, which load slowly
+
+        return rows.assign(sigma=deviates_of_means(ratio.to_numpy(), rows["M"].to_numpy() > 0, int(summary["count"])))
+    return rows.assign(sigma=ratio)
 
 
 def strongest(summary: xr.Dataset, kind: str) -> pd.DataFrame:

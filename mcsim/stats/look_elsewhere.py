@@ -232,6 +232,27 @@ def deviations(x: NDArray[np.float64], simulations: NDArray[np.float64]) -> NDAr
     return _normal((x - simulations.mean(axis=0)) / spread / np.sqrt(1.0 + 1.0 / count), count - 1)
 
 
+def deviates_of_means(ratio: NDArray[np.float64], complex_: NDArray[np.bool_], count: int) -> NDArray[np.float64]:
+    """Return the normal deviates of the two-sided probabilities of means over their errors, >= 0.
+
+    ``ratio``: the modulus of a mean of ``count`` draws over its standard error, of real numbers or, where ``complex_``,
+    of complex ones, whose parts have equal variances and whose error is that of both together. Zero for a single draw.
+
+    Notes
+    -----
+    Of t with n = ``count`` - 1 degrees of freedom, p = I_x(n/2, 1/2), x = n/(n + t^2), is x^(n/2) (1 - x)^(-1/2) over
+    n/2 B(n/2, 1/2) where it is so small that it underflows. Of F with 2 and 2 n it is (1 + t^2/n)^-n.
+    """
+    n = count - 1.0
+    if n < 1.0:
+        return np.zeros(np.shape(ratio))
+    t = np.abs(np.asarray(ratio))
+    more, p = np.log1p(t**2 / n), 2.0 * special.stdtr(n, -t)
+    far = -0.5 * (n * more + np.log(np.maximum(-np.expm1(-more), 1e-300))) - np.log(0.5 * n)
+    of_real = np.where(p > 1e-290, np.log(np.maximum(p, 1e-300)), far - special.betaln(0.5 * n, 0.5))
+    return np.asarray(np.abs(special.ndtri_exp(np.where(complex_, -n * more, of_real) - np.log(2.0))))
+
+
 def _normal(t: NDArray[np.float64], dof: int) -> NDArray[np.float64]:
     """Return the normal deviate of the same probability as a Student t."""
     return -np.sign(t) * special.ndtri(np.maximum(special.stdtr(dof, -np.abs(t)), 1e-300))
