@@ -41,6 +41,8 @@ def describe(path: str | Path) -> str:
         f"  digest    {attributes['digest']}",
         f"  made with {', '.join(f'{name} {number}' for name, number in attributes['packages'].items())}",
     ]
+    if others := attributes.get("other_packages"):
+        found.append(f"  and with  {', '.join(f'{name} {number}' for name, own in others.items() for number in own)}")
     if (target / "summary").is_dir():
         kind = "_difference" if paired else ""
         names = [f"biposh{kind}_binned_{what}" for what in ("mean", "standard_error")]

@@ -2,6 +2,7 @@
 
 import os
 import time
+import warnings
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -61,6 +62,7 @@ CONVENTIONS = {
     "normalisation": NORMALISATION,
     "weights": "maps times weights of unit mean square, spectra over the mean product of the two weights",
 }
+_NUMERIC = ("numpy", "healpy", "ducc0", "numba", "scipy")  #: packages that a realization's bits depend on
 _PACKAGES = ("mcsim", "numpy", "healpy", "ducc0", "numba", "scipy", "dask", "distributed", "zarr", "xarray")
 
 
@@ -182,6 +184,27 @@ def check_summarised(path: Path, run: config.RunConfig) -> None:
                 f"{path} has lost its attributes, and its summary is of another configuration ({key}: {before} -> "
                 f"{after}); give the one that it was made with."
             )
+
+
+def mixed(path: Path, old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the attributes of a store say of realizations of other packages that join it, and warn of these.
+
+    ``other_packages``: the versions beside those in ``packages``, by name; nothing if there are none.
+    """
+    known = {name: [*versions] for name, versions in old.get("other_packages", {}).items()}
+    joining = {name: [own] for name, own in new["packages"].items()}
+    for name, versions in new.get("other_packages", {}).items():
+        joining[name] = [*joining[name], *versions]
+    others = {}
+    for name in _NUMERIC:
+        each = [one for one in (*known.get(name, ()), *joining[name]) if one != old["packages"][name]]
+        if each:
+            others[name] = list(dict.fromkeys(each))
+    if others == known:
+        return {}
+    told = ", ".join(f"{name} {' and '.join(own)} beside {old['packages'][name]}" for name, own in others.items())
+    warnings.warn(f"{path} has realizations of different packages ({told}): their last bits may differ.", stacklevel=3)
+    return {"other_packages": others}
 
 
 def check_mergeable(path: Path, first: Mapping[str, Any], other: Path, second: Mapping[str, Any]) -> None:

@@ -80,6 +80,8 @@ def verify(path: str | Path, quiet: bool = True) -> Verdict:
                 damages.append(damage)
             finished += count
             report(float(min(start + chunk, size)), sum(len(d.lost) for d in damages))
+    if not (damages or broken) and (counted := store.summarised(target)[0]) > finished:
+        broken["done"] = f"the summary is of {counted} realizations, but {finished} are marked as finished"
     return Verdict(target, finished, size, tuple(damages), broken)
 
 

@@ -300,17 +300,18 @@ def chunk(path: Path) -> int:
 def extend(path: Path, realizations: int, update: Mapping[str, Any]) -> None:
     """Grow a store to more realizations, keep the finished ones, and change attributes.
 
-    ``done``, whose length is that of the store, grows last: another call completes an interrupted one.
+    ``done``, whose length is that of the store, grows last, after the attributes: another call completes an interrupted
+    one.
     """
     with refuse_unwritable(path):
         group = _open(path, "r+")
         growing = {name: array for name, array in group.arrays() if _over_realizations(array)}
         last = growing.pop("done")
-        for array in (*growing.values(), last):
+        for array in growing.values():
             array.resize((realizations, *array.shape[1:]))
-            if array is growing["realization"]:
-                array[:] = np.arange(realizations)
+        growing["realization"][:] = np.arange(realizations)
         group.attrs.update(update)
+        last.resize((realizations, *last.shape[1:]))
         _consolidate(path)
 
 

@@ -18,6 +18,7 @@ from distributed import Client
 
 from mcsim import config, open_ensemble
 from mcsim.ensemble import opening, prediction, runner, store
+from mcsim.ensemble.describe import describe
 from mcsim.ensemble.runner import cluster
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -117,6 +118,42 @@ def test_extension_keeps_what_is_there_and_gives_the_bits_of_one_run(
     assert runner.run(table(**ensemble(3)), path, workers=client).computed == 3
     assert runner.run(table(**ensemble(10)), path, workers=client).computed == 7
     assert_same(path, small_store)
+
+
+def test_an_extension_that_ends_before_the_store_has_grown_is_completed(
+    small_store: Path, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "extended.zarr"
+    runner.run(table(**ensemble(3)), path, workers=client)
+    with monkeypatch.context() as patched:
+        patched.setattr("zarr.core.attributes.Attributes.update", lambda self, given: pytest.fail("ends here"))
+        with pytest.raises(pytest.fail.Exception):
+            runner.run(table(**ensemble(10)), path, workers=client)
+    assert runner.run(table(**ensemble(10)), path, workers=client).computed == 7
+    assert_same(path, small_store)
+    assert store.attributes(path)["configuration"]["ensemble"]["realizations"] == 10
+
+
+def test_realizations_of_other_packages_are_told_of(client: Client, tmp_path: Path) -> None:
+    """In extensions and merged slices, where the packages of the first are not said to be those of all."""
+    path = tmp_path / "extended.zarr"
+    runner.run(table(**ensemble(2)), path, workers=client)
+    now = store.attributes(path)["packages"]
+    older = now | {"ducc0": "0.1", "dask": "1.0"}
+    store.extend(path, 2, {"packages": older})
+    runner.run(table(**ensemble(2)), path, workers=client)  # no realization is new
+    assert "other_packages" not in store.attributes(path)
+    with pytest.warns(UserWarning, match="ducc0"):
+        runner.run(table(**ensemble(3)), path, workers=client)
+    assert store.attributes(path)["packages"] == older
+    assert store.attributes(path)["other_packages"] == {"ducc0": [now["ducc0"]]}
+    other = tmp_path / "other.zarr"
+    runner.run(table(**ensemble(3)), other, workers=client)
+    merged = tmp_path / "merged.zarr"
+    with pytest.warns(UserWarning, match="ducc0 0.1 beside"):
+        runner.merge([other, path], merged)
+    assert store.attributes(merged)["other_packages"] == {"ducc0": ["0.1"]}
+    assert "ducc0 0.1" in describe(merged)
 
 
 def test_slices_merge_to_the_same_bits(small_store: Path, client: Client, tmp_path: Path) -> None:

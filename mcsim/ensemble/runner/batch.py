@@ -159,12 +159,17 @@ def _run(client: Client, shared: Survey, target: Path, wanted: range, journal: J
     if not target.exists():
         store.create(target, layout, _attributes(shared))
     plan.check_same(target, run)
-    size, found = store.size(target), store.attributes(target)["configuration"]
-    if run.ensemble.realizations > size:
-        store.extend(target, run.ensemble.realizations, _attributes(shared))
+    size, stored, own = store.size(target), store.attributes(target), _attributes(shared)
+    found, extended = stored["configuration"], run.ensemble.realizations > size
+    more = extended or not store.done(target, wanted.start, wanted.stop).all()
+    update = plan.mixed(target, stored, own) if more else {}
+    if extended:
+        store.extend(target, run.ensemble.realizations, own | {"packages": stored["packages"]} | update)
     elif found["biposh"]["summary_bin"] != layout.bin_width:
         biposh = found["biposh"] | {"summary_bin": layout.bin_width}
-        store.extend(target, size, {"configuration": found | {"biposh": biposh}})
+        store.extend(target, size, {"configuration": found | {"biposh": biposh}} | update)
+    elif update:
+        store.extend(target, size, update)
     layout = replace(layout, realizations=store.size(target), chunk=store.chunk(target))
     before = int(store.done(target).sum())
     try:

@@ -58,7 +58,9 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     _check_new(target)
     first = store.attributes(sources[0])
     for other in sources[1:]:
-        plan.check_mergeable(sources[0], first, other, store.attributes(other))
+        joining = store.attributes(other)
+        plan.check_mergeable(sources[0], first, other, joining)
+        first |= plan.mixed(target, first, joining)
     named: dict[str, Path] = {}
     for source in sources:
         if (before := named.setdefault(os.path.realpath(source), source)) is not source:
