@@ -25,10 +25,11 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
     """Read binned spectra with independent errors from an ECSV table, which must have the frame of the model.
 
     Columns are L, M, d, ell_min, ell_max, value, error, and value_imag if parts are imaginary; ``value`` is the mean
-    over ell_min <= l2 <= ell_max, d = l2 - l1, with its unit. The header's ``meta`` holds ``normalisation`` ("Bennett",
-    "WMAP" or "Hajian-Souradeep"), ``scaling`` ("l(l+1)/2pi" or "none") and optionally ``frame`` and ``lmax``, the
-    highest degree of the maps (default: of the configuration). ``mcsim info --export`` writes such tables, with a
-    column ``pair`` and, for paired ensembles, ``value_difference`` and so on.
+    over ell_min <= l2 <= ell_max, d = l2 - l1, with its unit. ``error`` of a mode with M > 0 is that of the modulus;
+    its parts may have errors of their own, error_real and error_imag. The header's ``meta`` holds ``normalisation``
+    ("Bennett", "WMAP" or "Hajian-Souradeep"), ``scaling`` ("l(l+1)/2pi" or "none") and optionally ``frame`` and
+    ``lmax``, the highest degree of the maps (default: of the configuration). ``mcsim info --export`` writes such
+    tables, with a column ``pair`` and, for paired ensembles, ``value_difference`` and so on.
     ``errors`` False: those of the table do not count, and are one each.
     Raise InputError for a table that cannot be read, does not define its numbers, or has the errors of fewer
     ``realizations`` (in its meta) than a fit takes from a store.
@@ -52,6 +53,7 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
         raise InputError(f"{path}: ell_min = {a}, ell_max = {b} is no range; correct the row.")
     first, last = selection.ell_range or (0, int(high.max()))
     real, error = (in_uk2(path, table, f"{name}{suffix}") for name in ("value", "error"))
+    of_parts = errors_of_parts(path, table, error, suffix)
     rows: list[Row] = []
     values: list[NDArray[np.float64]] = []
     sigmas: list[NDArray[np.float64]] = []
@@ -62,8 +64,7 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
             part = in_uk2(path, table, f"value_imag{suffix}") if imaginary else real
             rows += [Row(mode, int(low[i]), int(high[i]), imaginary) for i in same]
             values.append(part[same])
-            # The error of a mode with M > 0 is that of its modulus; its two parts share the variance equally.
-            sigmas.append(error[same] * (1.0 if mode.M == 0 else np.sqrt(0.5)))
+            sigmas.append((error if mode.M == 0 else of_parts[imaginary])[same])
     if not rows:
         raise InputError(
             f"{path} has no row of {', '.join(selection.modes)} within ell = {first} ... {min(last, high.max())}, and "
@@ -75,7 +76,8 @@ def read_table(path: str | Path, frame: str, selection: Selection = EVERYTHING, 
     count = count_of(path, table.meta)
     if errors:
         _warn_of_overlaps(path, rows)
-        _check_count(path, count, len(rows))
+        if "prediction" not in table.meta:  # whose errors are known
+            _check_count(path, count, len(rows))
     value = np.concatenate(values)
     sigma = np.concatenate(sigmas) if errors else np.ones_like(value)
     bad = np.flatnonzero(~(np.isfinite(value) & np.isfinite(sigma) & (sigma > 0.0)))
@@ -196,6 +198,20 @@ def read_ecsv(path: str | Path) -> Table:
     if missing:
         raise InputError(f"{path} has no column {missing[0]}; give {', '.join(COLUMNS)}, value and error.")
     return table
+
+
+def errors_of_parts(
+    path: str | Path, table: Table, error: NDArray[np.float64], suffix: str = ""
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the errors of real and imaginary parts of modes with M > 0, uK^2, shape (rows,) each.
+
+    They are the table's own, or share the variance of ``error``, that of the modulus, equally.
+    """
+    real, imaginary = (
+        in_uk2(path, table, name) if (name := f"error_{part}{suffix}") in table.colnames else error * np.sqrt(0.5)
+        for part in ("real", "imag")
+    )
+    return real, imaginary
 
 
 def _kind(path: str | Path, table: Table, kind: str | None) -> tuple[str, str]:

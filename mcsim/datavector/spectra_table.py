@@ -14,6 +14,7 @@ from mcsim.beamfit.table import (
     check_frame,
     check_parity,
     count_of,
+    errors_of_parts,
     highest_of,
     identified,
     in_uk2,
@@ -129,6 +130,7 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
     absent, highest = np.full(len(table), np.nan), highest_of(path, table.meta)
     real = in_uk2(path, table, "value")
     imag, stated = (in_uk2(path, table, name) if name in table.colnames else absent for name in ("value_imag", "error"))
+    of_parts = errors_of_parts(path, table, stated)
     found: dict[tuple[Row, Pair], tuple[float, float]] = {}
     for number, (L, M, d, low, high) in enumerate(identified(path, table).T.tolist()):
         label = str(table["pair"][number]) if "pair" in table.colnames else next(iter(known))
@@ -145,8 +147,7 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
                 raise InputError(f"{path}: {mode.name} at ell = {low}-{high} is {value:g}; leave the row out.")
             if key in found:
                 raise InputError(f"{path} gives a bin of one mode twice; keep one row of each.")
-            # The error of a mode with M > 0 is that of its modulus; its two parts share the variance.
-            found[key] = value, float(stated[number]) * (1.0 if M == 0 else np.sqrt(0.5))
+            found[key] = value, float((stated if M == 0 else of_parts[imaginary])[number])
     if not found:
         raise InputError(f"{path} has no finite value; give the measured bins.")
     (rows, pairs), (value, error) = zip(*found, strict=True), np.array(list(found.values())).T

@@ -118,7 +118,7 @@ class Layout:
         spectra, bins = sizes["pair"] * sizes["mode"], sizes["bin"]
         # A mean, a sum of squares, and of binned spectra their products: of maps, controls and differences.
         raw = (16 + 8) * spectra * sizes["ell"] + (8 + 8) * sizes["pair"] * sizes["ell"]
-        binned = (1 + self.filtered) * (16 + 8 + 16 * bins) * spectra * bins
+        binned = ((1 + self.filtered) * (16 + 8 + 16 * bins) + 8 + 8) * spectra * bins  # with real parts of bins
         return (1 + 2 * self.paired) * (raw + binned)
 
     def files(self) -> int:

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 QML, SCORE = "biposh_qml", "biposh_qml_score"
 """Start of the names of quadratic maximum-likelihood estimates, and of what is normalised to give them."""
 
+REAL = "_real"  #: end of the names of real parts of bins, of which errors alone are told
+
 
 @lru_cache(maxsize=2)
 def _factors(modes: tuple[Mode, ...], lmax: int) -> NDArray[np.float64]:
@@ -81,8 +83,9 @@ def reduce_rows(layout: Layout, rows: Mapping[str, NDArray]) -> Sums | None:
                 values[f"{name}_difference"] = values[name] - values[f"{name}_circular"]
         wide = [name for name in values if name.startswith("biposh") and not name.startswith(QML)]
         bins = {f"{name}_binned": binned(layout, values[name]) for name in wide}
+        parts = {f"{name}{REAL}": each.real for name, each in bins.items()}
         estimates = [name for name in values if name.startswith(QML) and not name.startswith(SCORE)]
-        return streaming.leaf(values | bins, covariance_of=(*bins, *estimates))
+        return streaming.leaf(values | bins | parts, covariance_of=(*bins, *estimates))
 
     return streaming.tree(node, len(rows["done"]))
 
@@ -116,6 +119,23 @@ def of_normalisation(layout: Layout, sums: Sums, probes: int, kind: str) -> NDAr
     return found
 
 
+def _errors_of_parts(
+    layout: Layout, sums: Sums, name: str, error: NDArray[np.float64]
+) -> dict[str, NDArray[np.float64]]:
+    """Return the errors of the means of real and imaginary parts of bins, whose squares add up to that of the modulus.
+
+    Where sums do not have them, as those of predictions, the parts of a mode with M > 0 share it equally.
+    """
+    if not name.endswith("_binned"):
+        return {}
+    if f"{name}{REAL}" in sums.mean:
+        real = streaming.standard_deviation(sums, f"{name}{REAL}") / np.sqrt(sums.count)
+    else:
+        share = [np.sqrt(0.5) if mode.M > 0 else float(mode.parity == "even") for mode in layout.modes]
+        real = np.array(share)[:, None] * error
+    return {"real": real, "imaginary": np.sqrt(np.maximum(error**2 - real**2, 0.0))}
+
+
 _MEANING = {
     "": "",
     "_circular": " of the circular-beam control",
@@ -134,7 +154,7 @@ def dataset(layout: Layout, sums: Sums, attributes: Mapping[str, Any]) -> "xr.Da
     import xarray as xr  # here: workers start an eighth faster without it
 
     variables: dict[str, tuple[Sequence[str], NDArray, dict[str, str]]] = {}
-    for name in [name for name in sums.mean if not name.startswith(SCORE)]:
+    for name in [name for name in sums.mean if not (name.startswith(SCORE) or name.endswith(REAL))]:
         raw = name.removesuffix("_binned")
         kind = raw.removeprefix(QML).removeprefix("biposh").removeprefix("cl")
         last = "ell" if raw == name and not raw.startswith(QML) else "bin"
@@ -155,6 +175,9 @@ def dataset(layout: Layout, sums: Sums, attributes: Mapping[str, Any]) -> "xr.Da
             ("standard_deviation", deviation, "standard deviation of one realization"),
         ):
             variables[f"{name}_{suffix}"] = (dims, array, {"units": "uK^2", "long_name": f"{meaning}: {text}"})
+        for part, array in _errors_of_parts(layout, sums, name, error).items():
+            text = f"{meaning}: standard error of the mean of its {part} part"
+            variables[f"{name}_standard_error_{part[:4]}"] = (dims, array, {"units": "uK^2", "long_name": text})
         if name in sums.comoment:
             text = f"{meaning}: covariance of one realization between bins"
             array = streaming.covariance(sums, name)

@@ -45,9 +45,10 @@ def strongest(summary: xr.Dataset, kind: str) -> pd.DataFrame:
 
 
 def table(summary: xr.Dataset) -> Table:
-    """Return binned spectra as a table: pair, L, M, d, ell_min, ell_max, value, value_imag, error, in uK^2.
+    """Return binned spectra as a table: pair, L, M, d, ell_min, ell_max, value, value_imag, error and so on, in uK^2.
 
-    ``value`` and ``value_imag`` are the real and imaginary part of the plain mean, ``error`` its standard error. For
+    ``value`` and ``value_imag`` are the real and imaginary part of the plain mean, ``error`` its standard error, and
+    ``error_real`` and ``error_imag`` those of the parts, whose squares add up to its own. For
     paired ensembles those of the difference to the circular-beam control follow. The header has units, scaling and
     normalisation.
     """
@@ -57,6 +58,9 @@ def table(summary: xr.Dataset) -> Table:
             mean = summary[f"biposh{kind}_binned_mean"]
             columns |= {f"value{kind}": mean.real, f"value_imag{kind}": mean.imag}
             columns[f"error{kind}"] = summary[f"biposh{kind}_binned_standard_error"]
+            for part in ("real", "imag"):
+                if (name := f"biposh{kind}_binned_standard_error_{part}") in summary:
+                    columns[f"error_{part}{kind}"] = summary[name]
     rows = xr.Dataset(columns).to_dataframe(dim_order=["pair", "mode", "bin"]).reset_index()
     rows = rows[np.isfinite(rows["value"])].rename(columns={"bin_first": "ell_min", "bin_last": "ell_max"})
     result = Table({"pair": rows["pair"].to_numpy(dtype=str)})

@@ -132,6 +132,14 @@ def _component(one: xr.Dataset, name: str, imaginary: bool) -> np.ndarray:
     return np.asarray(values.imag if imaginary else values.real)
 
 
+def _error(one: xr.Dataset, name: str, imaginary: bool) -> np.ndarray:
+    """Return the standard error of a part; in summaries that do not have it parts share that of the modulus equally."""
+    own = f"{name}_standard_error_{'imag' if imaginary else 'real'}"
+    if own in one:
+        return np.asarray(one[own].values)
+    return np.asarray((1.0 if int(one["M"]) == 0 else np.sqrt(0.5)) * one[f"{name}_standard_error"].values)
+
+
 def _expected(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
     """Draw the prediction of one mode, a line for each part."""
     name = f"biposh{'_difference' if paired else ''}_binned_mean"
@@ -144,17 +152,14 @@ def _spectrum(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
     """Draw one mode: points with errors and, if paired, the band of the plain mean behind them."""
     d, M, odd = int(one["d"]), int(one["M"]), str(one["parity"].values) == "odd"
     name, x = f"biposh{'_difference' if paired else ''}_binned", _abscissa(one)
-    # The two parts of a mode with M > 0 share the variance of its modulus.
-    share = 1.0 if M == 0 else np.sqrt(0.5)
-    error = share * one[f"{name}_standard_error"].values
     for imaginary in _parts(one):
         label = f"d = {d}" + (f", {'imaginary' if imaginary else 'real'}" if M > 0 or odd else "")
         filling, marker = "white" if imaginary and M > 0 else colour, "s" if imaginary else "o"
-        values = _component(one, f"{name}_mean", imaginary)
+        values, error = _component(one, f"{name}_mean", imaginary), _error(one, name, imaginary)
         axes.errorbar(
             x, values, error, fmt=marker, ms=3.5, mfc=filling, color=colour, linewidth=1.0, capsize=2, label=label
         )
         if paired and M == 0:
             middle = _component(one, "biposh_binned_mean", imaginary)
-            width = share * one["biposh_binned_standard_error"].values
+            width = _error(one, "biposh_binned", imaginary)
             axes.fill_between(x, middle - width, middle + width, color=colour, alpha=0.15, linewidth=0)

@@ -17,7 +17,7 @@ import xarray as xr
 from distributed import Client
 
 from mcsim import config, open_ensemble
-from mcsim.ensemble import opening, prediction, runner, store
+from mcsim.ensemble import opening, prediction, runner, store, summary
 from mcsim.ensemble.describe import describe
 from mcsim.ensemble.runner import cluster
 from mcsim.simulation import simulate
@@ -53,6 +53,18 @@ def test_store_holds_what_a_realization_gives(small_store: Path) -> None:
         assert stored.sel(mode="L2M0d0").biposh.dims == ("realization", "pair", "ell")
         assert stored.biposh.attrs["units"] == "uK^2"
         assert all("long_name" in variable.attrs for variable in stored.variables.values())
+
+
+def test_parts_of_binned_spectra_have_errors_of_their_own(small_store: Path) -> None:
+    layout = opening.layout(small_store, 10)
+    with open_ensemble(small_store) as stored, opening.open_summary(small_store) as found:
+        bins = summary.binned(layout, stored.biposh.values)
+        errors = [found[f"biposh_binned_standard_error{part}"].values for part in ("", "_real", "_imag")]
+        long_name = found.biposh_binned_standard_error_imag.attrs["long_name"]
+    for error, part in zip(errors[1:], (bins.real, bins.imag), strict=True):
+        np.testing.assert_allclose(error, part.std(axis=0, ddof=1) / np.sqrt(10.0), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(errors[1] ** 2 + errors[2] ** 2, errors[0] ** 2, rtol=1e-12)
+    assert "imaginary" in long_name
 
 
 def test_store_says_all_conventions_that_its_arrays_rest_on(small_store: Path) -> None:

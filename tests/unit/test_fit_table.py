@@ -59,9 +59,20 @@ def test_errors_of_few_realizations_are_no_known_errors(tmp_path):
         read(tmp_path, table(META | {"realizations": 5}))
     with pytest.warns(UserWarning, match="6 realizations"):
         assert read(tmp_path, table(META | {"realizations": 6})).count == 6
+    assert read(tmp_path, table(META | {"realizations": 5, "prediction": "leading order"})).count == 5
     assert read(tmp_path, table()).count == 1
     with refused("table.ecsv", "few"):
         read(tmp_path, table(META | {"realizations": "few"}))
+
+
+def test_parts_have_their_own_errors_or_share_that_of_the_modulus(tmp_path):
+    complex_ = {"M": [1, 1, 1], "value_imag": [0.1, 0.2, 0.3]}
+    chosen = {"modes": ["L2M1d0"]}
+    found = read(tmp_path, table(d=[0, 0, 0], ell_max=[19, 29, 9], ell_min=[10, 20, 0], **complex_), **chosen)
+    np.testing.assert_allclose(np.diag(found.covariance), 0.5 * np.array([0.01, 0.04, 0.09] * 2))
+    own = complex_ | {"error_real": [0.06, 0.1, 0.1], "error_imag": [0.08, 0.2, 0.3]}
+    found = read(tmp_path, table(d=[0, 0, 0], ell_max=[19, 29, 9], ell_min=[10, 20, 0], **own), **chosen)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), [0.06, 0.1, 0.1, 0.08, 0.2, 0.3])
 
 
 def test_units_are_converted(tmp_path):
