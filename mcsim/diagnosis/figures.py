@@ -1,5 +1,6 @@
 """Pictures of a diagnosis: excess chi^2, candidates, elements, residual maps, correlations and calibration."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,9 @@ BLUE, RED, AMBER = "#0072b2", "#d55e00", "#e69f00"
 
 TOP, MAPS, LEAST = 15, 12, 1e-8
 """Candidates that are drawn, residual maps, and the p-value where the scale of controls ends."""
+
+WHOLE = 64
+"""Characters up to which the names of candidates and elements are drawn whole."""
 
 LIMIT = 8.0
 """Deviation at which the colours of the table of blocks end."""
@@ -69,7 +73,7 @@ def candidates_figure(result: DiagnosisResult) -> Figure:
     named, others = (accepted[0] if accepted else set()), set().union(*accepted[1:])
     colours = [BLUE if row.label in named else AMBER if row.label in others else "#b5b5b5" for row in rows]
     axes.barh(range(len(rows)), [row.significance for row in rows], height=0.7, color=colours)
-    axes.set_yticks(range(len(rows)), [_label(row.label, 46) for row in rows], fontsize=8)
+    axes.set_yticks(range(len(rows)), _labels([row.label for row in rows], WHOLE), fontsize=8)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlim(0.0, None)
     shown = [("blue: best set", BLUE), ("amber: an alternative", AMBER)]
@@ -91,7 +95,9 @@ def blocks_figure(result: DiagnosisResult) -> Figure:
         [(kinds.index(e.family), names.index(column)) for e, column in zip(result.elements, columns, strict=True)]
     )
     panels = {"before": result.z} | ({} if result.z_after is None else {"after the best fit": result.z_after})
-    width = 3.4 + len(panels) * (0.62 * len(names) + 0.3)
+    rows = _labels(kinds, 80)
+    # Beside the names of the rows panels of less than 1.6 inches would cut their titles and the words of the bar.
+    width = 0.3 + 0.062 * max(map(len, rows)) + len(panels) * max(0.62 * len(names) + 0.3, 1.6)
     figure = Figure(figsize=(width, 2.6 + 0.27 * len(kinds)), layout="constrained")
     grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     shown: Any = None
@@ -104,11 +110,10 @@ def blocks_figure(result: DiagnosisResult) -> Figure:
         shown = axes.imshow(table, cmap="RdBu_r", vmin=-LIMIT, vmax=LIMIT, aspect="auto")
         numbers = ((cell, f"{value:+.1f}") for cell, value in np.ndenumerate(table) if np.isfinite(value))
         write_cells(axes, numbers, np.abs(table) > 0.62 * LIMIT, 7)
-        labels = [_label(name, 22) for name in names]
-        axes.set_xticks(range(len(names)), labels, rotation=45, ha="right", fontsize=8)
-        axes.set_yticks(range(len(kinds)), [_label(kind, 80) for kind in kinds], fontsize=8)
+        axes.set_xticks(range(len(names)), _labels(names, 22), rotation=45, ha="right", fontsize=8)
+        axes.set_yticks(range(len(kinds)), rows, fontsize=8)
         axes.set_title(title, fontsize=10)
-    label = "largest deviation [standard deviations]\ngrey: not measured"
+    label = "largest deviation\n[standard deviations]\ngrey: not measured"
     figure.colorbar(shown, ax=list(grid), label=label, extend="both", location="bottom", shrink=0.6, aspect=40)
     return figure
 
@@ -160,9 +165,9 @@ def residual_figure(result: DiagnosisResult) -> Figure | None:
     shown: Any = None
     # Sharp pixels: smoothed ones make the file three times as large.
     style: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -4.0, "vmax": 4.0, "interpolation": "nearest"}
-    for axes, k in zip(grid, chosen, strict=False):
+    names = _labels([result.maps[k].replace(":", " ") for k in chosen], 40)
+    for axes, k, name in zip(grid, chosen, names, strict=False):
         shown = mollweide(axes, result.residual_maps[k], 700, **style)
-        name = _label(result.maps[k].replace(":", " "), 40)
         low, high = result.residual_range[k]
         axes.set_title(f"{name}: rms {rms[k]:.2f} (simulations {low:.2f} to {high:.2f})", fontsize=9)
     for axes in grid:
@@ -247,7 +252,8 @@ def contrast_figure(result: DiagnosisResult, one: Contrast) -> Figure:
         axes.plot(result.prediction(which)[where], at, marker, color=colour, linestyle="none", label=label)
     z = result.z[where]
     axes.errorbar(z, range(len(rows)), xerr=1.0, fmt="o", color="black", markersize=4, capsize=2, label="data")
-    labels = [f"{_label(result.elements[k].words, 64)}  ({100 * share:.0f} %)" for k, share in rows]
+    names = _labels([result.elements[k].words for k in where], WHOLE)
+    labels = [f"{name}  ({100 * share:.0f} %)" for name, (_, share) in zip(names, rows, strict=True)]
     axes.set_yticks(range(len(rows)), labels, fontsize=8)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.axvline(0.0, color="0.6", linewidth=0.8, zorder=0)
@@ -258,12 +264,12 @@ def contrast_figure(result: DiagnosisResult, one: Contrast) -> Figure:
 
 
 def _matrix(result: DiagnosisResult, values: NDArray[np.float64], label: str, scale: dict[str, Any]) -> Figure:
-    labels = [_label(one.label, 44) for one in result.candidates]
-    side = 3.2 + max(2.4, 0.15 * len(labels))
+    labels = _labels([one.label for one in result.candidates], WHOLE)
+    size = 6.5 if len(labels) > 12 else 9
+    side = 0.8 + 0.008 * size * max(map(len, labels), default=0) + max(2.4, 0.15 * len(labels))
     figure = Figure(figsize=(side, side + 0.8), layout="constrained")
     axes = figure.subplots()
     shown = axes.imshow(values, interpolation="nearest", **scale)
-    size = 6.5 if len(labels) > 12 else 9
     axes.set_xticks(range(len(labels)), labels, rotation=90, fontsize=size)
     axes.set_yticks(range(len(labels)), labels, fontsize=size)
     accepted = result.sets[0].candidates if result.sets else ()
@@ -274,6 +280,14 @@ def _matrix(result: DiagnosisResult, values: NDArray[np.float64], label: str, sc
     bar = figure.colorbar(shown, ax=axes, location="top", aspect=30, extend=extend)
     bar.set_label(label, fontsize=9)
     return figure
+
+
+def _labels(texts: Sequence[str], width: int) -> list[str]:
+    """Return labels of at most ``width`` characters, or of as many more as keep different texts apart."""
+    different = len(set(texts))
+    while len({_label(text, width) for text in texts}) < different:
+        width += 1
+    return [_label(text, width) for text in texts]
 
 
 def _label(text: str, width: int) -> str:
