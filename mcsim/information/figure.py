@@ -1,8 +1,9 @@
-"""Picture of the limit: errors and detectable amplitudes of every effect, and which can be told apart."""
+"""Picture of the limit: errors and detectable amplitudes of every effect, which are possible, and which told apart."""
 
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
@@ -15,7 +16,10 @@ BLUE, AMBER, GREY = "#0072b2", "#e69f00", "#b5b5b5"
 
 
 def limit_figure(found: Limits) -> Figure:
-    """Draw sigma and detectable amplitudes in units of sigma, with their values, and the matrix of correlations."""
+    """Draw sigma and detectable amplitudes in units of sigma, with their values, and the matrix of correlations.
+
+    Amplitudes that an effect cannot have are hatched, and their values have an asterisk.
+    """
     effects = found.effects
     count = len(effects)
     figure = Figure(figsize=(13.5, 2.4 + 0.27 * count), layout="constrained")
@@ -30,13 +34,16 @@ def limit_figure(found: Limits) -> Figure:
         left.barh(rows, ratio, height=0.72, color=colour, label=text)
     apart = np.array([np.inf if np.isinf(one.separable) else one.separable / one.sigma for one in effects])
     inside, beyond = apart < REACH, apart >= REACH  # neither without another effect
+    starred = np.array([one.amplitude("separable").endswith("*") for one in effects])
     style: dict[str, Any] = {"markersize": 9, "markeredgewidth": 1.6, "linestyle": "none", "color": "black"}
     left.plot(apart[inside], rows[inside], marker="|", label="told apart from the most similar", **style)
     left.plot([0.97 * REACH] * int(np.sum(beyond)), rows[beyond], marker="$>$", label="beyond", **style)
+    left.plot([0.92 * REACH] * int(np.sum(beyond & starred)), rows[beyond & starred], "*", color="black", markersize=5)
+    _hatch_impossible(left, found)
     beside: dict[str, Any] = {"va": "center", "fontsize": 7, "parse_math": False}
     for row, one in enumerate(effects):
         unit = "" if one.unit.startswith("1") else f" ({one.unit})"
-        shown = f"{number(one.sigma)} | {number(one.amplitude_90)}{unit}"
+        shown = f"{number(one.sigma)} | {one.amplitude('amplitude_90')}{unit}"
         left.annotate(shown, (1.0, row), (4, 0), ("axes fraction", "data"), "offset points", **beside)
     left.set_yticks(rows, [one.title for one in effects], fontsize=8, parse_math=False)
     left.set_ylim(count - 0.4, -0.6)
@@ -54,3 +61,11 @@ def limit_figure(found: Limits) -> Figure:
     bar = figure.colorbar(image, ax=right, ticks=range(7), shrink=0.7, aspect=40)
     bar.ax.set_yticklabels([f"{level:g}" for level in levels])
     return figure
+
+
+def _hatch_impossible(axes: Axes, found: Limits) -> None:
+    """Hatch amplitudes that are more than each effect can have, with a line of the legend if there are any."""
+    ends = [REACH if np.isinf(one.sigma) else min(one.amplitude_max / one.sigma, REACH) for one in found.effects]
+    faded: dict[str, Any] = {"facecolor": (1.0, 1.0, 1.0, 0.6), "edgecolor": "0.55", "linewidth": 0.0, "hatch": "////"}
+    label = "*, hatched: not possible" if found.impossible or min(ends) < REACH else None
+    axes.barh(range(len(ends)), REACH - np.array(ends), left=ends, height=0.72, label=label, **faded)

@@ -104,6 +104,12 @@ class Limits:
     settings: LimitSettings
 
     @property
+    def impossible(self) -> bool:
+        """Return True if an effect has an amplitude here that it cannot have."""
+        keys = ("amplitude_90_known", "amplitude_90", "separable")
+        return any(one.amplitude(key).endswith("*") for one in self.effects for key in keys)
+
+    @property
     def conventions(self) -> str:
         """Say what the amplitudes mean."""
         s = self.settings
@@ -141,8 +147,7 @@ class Limits:
         table = ["  ".join(f"{cell:{side[i]}{widths[i]}}" for i, cell in enumerate(row)) for row in rows]
         worst = max((one.error for one in self.effects), default=0.0)
         error = f" Errors of sigma from random probes: at most {100 * worst:.2g} %." if worst else ""
-        beyond = "*: more than the effect can have (mcsim effects says what is possible)."
-        marked = beyond if any(cell.endswith("*") for row in rows for cell in row) else ""
+        marked = "*: more than the effect can have (mcsim effects says what is possible)." if self.impossible else ""
         said = [marked, self.conventions, f"{self.method}.{error}", self.unknowns]
         return [*(line.rstrip() for line in table), *filter(None, said)]
 

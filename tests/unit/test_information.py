@@ -400,6 +400,20 @@ def test_limits_are_written_and_say_what_they_are(tmp_path) -> None:
     assert "noise_level" not in describe(model(), mcsim.LimitSettings())
 
 
+def test_the_picture_hatches_what_an_effect_cannot_have() -> None:
+    found = mcsim.limit(model(), settings=mcsim.LimitSettings(only=("noise_level",), dense=True))
+    first, second = found.effects
+    lines = []
+    for share in (np.inf, 2.0):
+        bounded = replace(found, effects=(replace(first, amplitude_max=share * first.sigma), second))
+        axes = limit_figure(bounded).axes[0]
+        lines.append(len(axes.get_legend().get_texts()))
+        hatched = [bar.get_x() for bar in axes.patches if bar.get_hatch() and bar.get_width() > 0.0]
+        assert hatched == pytest.approx([share] if np.isfinite(share) else [])
+        assert bounded.impossible == np.isfinite(share)
+    assert lines[1] == lines[0] + 1
+
+
 def test_command_says_what_it_would_cost_and_reads_nuisances() -> None:
     said = CliRunner().invoke(app, ["limit", "demo-model", "--dry-run", "--dense", "--only", "noise_level"])
     assert said.exit_code == 0
