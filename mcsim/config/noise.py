@@ -129,6 +129,8 @@ NOISES: dict[str, Any] = {get_args(each)[0].kind: get_args(each)[0] for each in 
 
 def is_noise_free(noise: Any) -> bool:
     """Return True if the noise is zero everywhere."""
+    if isinstance(noise, NoiseDepth):
+        return noise.depth_uk_arcmin == 0.0
     return isinstance(noise, Noise) and noise.sigma0_uk == 0.0
 
 

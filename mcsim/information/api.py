@@ -207,8 +207,8 @@ def inverse_covariance(
             )
         if m.noise_uk is None:
             raise InputError(
-                f"map {m.name} has no noise, so that nothing limits it; give channel {channel.name} a "
-                "noise.sigma0_uk above 0."
+                f"map {m.name} has no noise, so that nothing limits it; give channel {channel.name} noise "
+                "(noise.sigma0_uk or noise.depth_uk_arcmin above 0)."
             )
         seen = m.moments.hits > 0 if analysed.weight is None else (m.moments.hits > 0) & (analysed.weight > 0.0)
         response = convolve.Response(channel.response.factors[: settings.orders + 1])

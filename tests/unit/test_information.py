@@ -424,9 +424,9 @@ def test_command_says_what_it_would_cost_and_reads_nuisances() -> None:
 
 
 def test_bad_input_is_refused() -> None:
-    quiet = model(channel=[{**channel("V1", "A", (1150.0, 900.0), 0.0)}])
-    with refused("V1:half1", "noise.sigma0_uk"):
-        mcsim.limit(quiet)
+    for noise in ({"sigma0_uk": 0.0}, {"kind": "depth", "depth_uk_arcmin": 0.0}):
+        with refused("V1:half1", "noise.sigma0_uk", "noise.depth_uk_arcmin"):
+            mcsim.limit(model(channel=[channel("V1", "A", (1150.0, 900.0), 0.0) | {"noise": noise}]))
     with refused("no_such"):
         mcsim.limit(model(), settings=mcsim.LimitSettings(only=("no_such",)))
     with refused("beam_width", "--without"):  # of two effects, the other alone was computed

@@ -179,6 +179,12 @@ def test_depth_is_noise_per_arcmin():
     assert expected * healpy.nside2pixarea(NSIDE) == pytest.approx(np.deg2rad(600.0 / 60.0) ** 2)
 
 
+def test_a_depth_of_zero_is_no_noise():
+    """Effects on noise were candidates, and what weights by the noise divided by zero."""
+    m, _ = noise_of({"kind": "depth", "depth_uk_arcmin": 0.0})
+    assert m.noise_uk is None
+
+
 @pytest.mark.parametrize("kind", ["hits", "variance"])
 def test_what_is_not_observed_in_the_file_is_not_observed(kind, tmp_path):
     south = PIXEL >= NPIX // 2
