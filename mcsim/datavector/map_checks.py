@@ -11,6 +11,7 @@ import numpy as np
 from mcsim import config
 from mcsim.datavector.filter_model import Model, sky_variance
 from mcsim.datavector.parts import Part
+from mcsim.datavector.summaries import Element
 from mcsim.ensemble.external_maps import in_uk, parts_of
 from mcsim.ensemble.maps import POINTING, file_names, first_realization
 from mcsim.errors import InputError
@@ -55,6 +56,19 @@ def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
             "its header (TUNIT1), or give it in uK."
         )
     return map_
+
+
+def check_pixels(model: Model, elements: Sequence[Element]) -> None:
+    """Raise InputError for a map with fewer observed pixels than numbers are measured of it."""
+    for part in model.parts:
+        own = (model.channels[part.channel],)
+        needed = sum(one.channels == own and one.split in (None, part.split) for one in elements)
+        if (observed := int(np.sum(part.precision > 0.0))) < needed:
+            raise InputError(
+                f"the model observes {observed} pixels of map {part.name}, and a diagnosis measures {needed} numbers "
+                f"of it, for which it needs {needed} pixels or more; give a mask (map.mask) that hides less, or finer "
+                "pixels."
+            )
 
 
 def share_left_out(part: Part, map_: Map) -> float:

@@ -18,7 +18,7 @@ from mcsim.datavector.analysis import Analysis, Job, analysis_of, check_asked, d
 from mcsim.datavector.campaign import asking, batch
 from mcsim.datavector.candidate import TemplateBank
 from mcsim.datavector.kept import Kept
-from mcsim.datavector.map_checks import checked_maps, given_maps, of_pixel_means
+from mcsim.datavector.map_checks import check_pixels, checked_maps, given_maps, of_pixel_means
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.seeds import Checked
 from mcsim.datavector.settings import DiagnosisSettings
@@ -234,6 +234,8 @@ def _analysed(
             "no effect of the library can be found in these data: none applies to the model and is not left out; leave "
             "fewer out (--without), or give others (library)."
         )
+    if table is None:
+        check_pixels(analysis.model, analysis.elements)
     power.check(analysis.model.survey)
     return run, analysis, table, given
 

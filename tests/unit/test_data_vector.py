@@ -10,7 +10,7 @@ from instruments import two_channels
 from mcsim import config
 from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.filter_model import model_of
-from mcsim.datavector.map_checks import checked_map
+from mcsim.datavector.map_checks import check_pixels, checked_map
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element, blocks_of, pair_classes, ranges_within
 from mcsim.datavector.wiener_filter import wiener_filter
@@ -141,6 +141,20 @@ def test_a_map_that_is_refused_is_told_by_how_much(analysis, unseen, factor, nam
     map_uk[:unseen] = healpy.UNSEEN
     with refused("W1", *named):
         checked_map(analysis.model, analysis.model.parts[0], map_uk, "the map of W1")
+
+
+def test_a_map_of_fewer_pixels_than_numbers_are_measured_of_it_is_refused(analysis) -> None:
+    model, elements = analysis.model, analysis.elements
+    own = sum(one.channels == ("V1",) and one.split in (None, "half1") for one in elements)
+    first = model.parts[0]
+    for seen in (own, own - 1):
+        few = np.where(np.arange(first.precision.size) < seen, first.precision[0], 0.0)
+        masked = replace(model, parts=(replace(first, precision=few), *model.parts[1:]))
+        if seen == own:
+            check_pixels(masked, elements)
+        else:
+            with refused(own - 1, own, "V1:half1", "map.mask"):
+                check_pixels(masked, elements)
 
 
 def test_a_map_without_noise_needs_a_floor_of_it() -> None:
