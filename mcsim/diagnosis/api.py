@@ -29,6 +29,7 @@ from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.measured_spectra import MeasuredSpectra
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.output import check_outside, check_replaced, digest
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.ensemble.external import ExternalModel, loaded
 from mcsim.ensemble.external_maps import Source
@@ -69,7 +70,8 @@ def diagnose(
         name ("W1:half1") or channel by channel, split by split; or a table of measured spectra
         (:func:`mcsim.datavector.spectra_table.read_spectra`).
     output
-        Folder for ``verdict.json``, ``diagnosis.zarr`` and ``report.html``; None: nothing is written.
+        Folder for ``verdict.json``, ``diagnosis.zarr`` and ``report.html``, in place of those of an earlier diagnosis
+        of this case and these data; None: nothing is written.
     case
         Name; default: that of the run.
     settings
@@ -101,12 +103,15 @@ def diagnose(
     if output is not None:
         output = folders.user_path(output)
         folders.writable(output)
+        check_outside(output, data)
     processes = run.compute.workers if workers is None else workers
     load_ahead(processes)
     run, analysis, table, given = _analysed(run, source, data, settings, library, wanted)
     check_asked(analysis, asked)
     task: Callable[[Job], NDArray[np.float64]] = data_vectors if table is None else table
     maps = checked_maps(analysis.model, given) if given else []
+    if output is not None:
+        check_replaced(output, str(case or run.name), digest(maps if table is None else [table.value]))
     means = source is None and bool(given) and isinstance(data, str | Path) and of_pixel_means(analysis.model, data)
     key = _key(run, analysis)
     with batch(processes) as call:

@@ -7,6 +7,7 @@ import numpy as np
 from mcsim.datavector.localisation import Place, places
 from mcsim.datavector.spectra_table import Spectra
 from mcsim.diagnosis.context import DataSet
+from mcsim.diagnosis.output import DIGEST, digest
 from mcsim.errors import InputError
 from mcsim.support.arrays import Matrix, Vector
 
@@ -105,5 +106,5 @@ class MeasuredSpectra(DataSet[Spectra]):
         return places(values, drawn, elements, self.context.settings.place_pvalue)
 
     def provenance(self) -> dict[str, str | int]:
-        """Return the file of the table, and the number of skies."""
-        return {"table": self.data.path, "skies behind the mean": self.realizations}
+        """Return the file of the table, the hash of its values, and the number of skies."""
+        return {"table": self.data.path, DIGEST: digest([self.data.value]), "skies behind the mean": self.realizations}

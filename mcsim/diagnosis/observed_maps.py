@@ -15,6 +15,7 @@ from mcsim.datavector.map_checks import exchanges, share_left_out
 from mcsim.datavector.nuisances import half_given_other
 from mcsim.datavector.same_skies import SameSkies, Skies
 from mcsim.diagnosis.context import DataSet
+from mcsim.diagnosis.output import DIGEST, digest
 from mcsim.support.arrays import Map, Matrix, Vector
 from mcsim.systematics import if_possible
 
@@ -200,3 +201,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         ensemble = self.context.ensemble
         drawn = len(ensemble.bipolar_scan)
         return standardised(self._measured[2], ensemble.residual_mean, ensemble.residual_scatter, drawn)
+
+    def provenance(self) -> dict[str, str | int]:
+        """Return the hash of the maps."""
+        return {DIGEST: digest(self.data)}
