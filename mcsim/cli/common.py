@@ -8,7 +8,7 @@ from tempfile import TemporaryFile
 from types import FrameType
 from typing import Annotated, Any
 
-from typer import Argument, Exit, Option
+from typer import Argument, BadParameter, Exit, Option
 from typer.core import TyperCommand, TyperGroup
 
 from mcsim.errors import InputError
@@ -48,20 +48,42 @@ _KEPT = {
 """What commands keep of what they have finished, and go on with."""
 
 
-def _again(ctx: Any) -> str:
-    """Return a clause on what an interrupted command does when it is called again."""
+def _name(ctx: Any) -> str:
+    """Return the name of a command, behind that of its group."""
     names: list[str] = []
     while ctx.parent is not None:
         names.insert(0, ctx.info_name)
         ctx = ctx.parent
-    command = " ".join(names)
+    return " ".join(names)
+
+
+def _again(ctx: Any) -> str:
+    """Return a clause on what an interrupted command does when it is called again."""
+    command = _name(ctx)
     if command not in _KEPT:
         return f"call mcsim {command} again"
     return f"finished {_KEPT[command]} are kept, and mcsim {command} goes on with them when it is called again"
 
 
+def _refusal(error: BadParameter) -> InputError | None:
+    """Return a sentence on a value that an option cannot have; None for what is missing or unknown."""
+    found = getattr(error.__cause__, "errors", None)  # of pydantic, with which typer reads values
+    if found is None or error.param is None:
+        return None
+    first, option = found()[0], error.param.opts[0]
+    why = first["msg"][:1].lower() + first["msg"][1:]
+    return InputError(f"{option} {first['input']}: {why}; mcsim {_name(error.ctx)} -h says what it can be.")
+
+
 class Command(TyperCommand):
     """A command whose flags show no type in --help, and that ends in order when it is interrupted."""
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """Read the words of the command; a value that an option cannot have is bad input as any other."""
+        try:
+            return super().make_context(info_name, args, parent, **extra)
+        except BadParameter as error:
+            raise _refusal(error) or error from None
 
     def get_params(self, ctx: Any) -> Any:
         """Return the parameters of the command."""

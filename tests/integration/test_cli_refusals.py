@@ -58,6 +58,9 @@ from .conftest import SMALL, Command, assert_refused
         (("run", "quickstart", "--scheduler", "nonsense"), ("nonsense", "5 s")),
         (("run", "quickstart", "--dry-run", "--scheduler", "nonsense"), ("nonsense", "5 s")),
         (("diagnose", "tiny", "x", "--dry-run", "--scheduler", "nonsense"), ("nonsense", "5 s")),
+        (("diagnose", "tiny", "x", "--workers", "-1"), ("--workers", -1, 0)),
+        (("run", "quickstart", "--workers", "two"), ("--workers", "two")),
+        (("challenge", "make", "quickstart", "-o", "x", "--cases", "0"), ("--cases", 0, 1)),
     ],
 )
 def test_bad_input_is_one_sentence(
