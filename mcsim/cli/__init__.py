@@ -433,8 +433,7 @@ def config(
         check_scans(loaded)
         check_effects(loaded)
         check_nuisances(loaded)
-        plain = config_.resolved(loaded)
-        plain["map"].setdefault("offset_order", 1)
-        print(json.dumps({"digest": config_.digest(loaded), **plain}, indent=2, ensure_ascii=False))
+        plain = {"digest": config_.digest(loaded), **config_.complete(loaded)}
+        print(json.dumps(plain, indent=2, ensure_ascii=False))
     else:
         raise InputError("Nothing was asked for; give a configuration to check, or --schema.")

@@ -2,7 +2,17 @@
 
 from mcsim.config.beams import BeamBlm, BeamEllipticalGaussian, BeamGaussian, BeamMap, BeamWindow
 from mcsim.config.identity import differences, digest, science
-from mcsim.config.load import check_skies, from_json, json_schema, load, prepared_grid, resolved, to_dict, to_json
+from mcsim.config.load import (
+    check_skies,
+    complete,
+    from_json,
+    json_schema,
+    load,
+    prepared_grid,
+    resolved,
+    to_dict,
+    to_json,
+)
 from mcsim.config.noise import Noise
 from mcsim.config.paths import channel_path, sky_path
 from mcsim.config.schema import (
@@ -53,6 +63,7 @@ __all__ = [
     "analysis_lmax",
     "channel_path",
     "check_skies",
+    "complete",
     "differences",
     "digest",
     "from_json",

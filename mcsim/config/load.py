@@ -118,6 +118,16 @@ def resolved(config: RunConfig) -> dict[str, Any]:
     return plain
 
 
+def complete(config: RunConfig) -> dict[str, Any]:
+    """Return :func:`resolved` for people, with the defaults too that stores of runs without them leave out."""
+    plain, every = resolved(config), _ADAPTER.dump_python(config, mode="json", by_alias=True)
+    for table in ("map", "biposh", "ensemble"):
+        plain[table] = every[table] | plain[table]
+    if config.map.offset_order is None:
+        plain["map"]["offset_order"] = 1
+    return every | plain
+
+
 def prepared_grid(config: RunConfig) -> tuple[int, str]:
     """Return nside (0 without pixels) and frame of the maps after their preparation."""
     return grid_after(config.preparation, config.map.resolution, config.map.frame)

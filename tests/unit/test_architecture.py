@@ -81,6 +81,7 @@ PUBLIC = {
         "analysis_lmax",
         "channel_path",
         "check_skies",
+        "complete",
         "differences",
         "digest",
         "from_json",

@@ -4,6 +4,7 @@ import json
 import re
 import tomllib
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,19 @@ def test_defaults(plain, folder):
     assert [config.pixel_window(run, channel) for channel in run.channels] == ["none", "computed"]
     assert config.map_names(run) == ("W1", "V1")
     assert run.channels[1].scan.model == str(folder / "scan.toml")
+
+
+def test_a_complete_run_has_every_key_and_loads_as_the_same():
+    run = config.load("tiny")
+    found, schema = config.complete(run), config.json_schema()
+    assert found.keys() == schema["properties"].keys()
+    for table, name in (("sky", "Sky"), ("map", "Map"), ("biposh", "Biposh"), ("ensemble", "Ensemble")):
+        assert found[table].keys() == schema["$defs"][name]["properties"].keys()
+    assert found["map"]["offset_order"] == 1
+    assert config.complete(config.load(found)) == found
+    assert config.digest(config.load(found)) == config.digest(run)
+    without = replace(run, map=replace(run.map, pixel_window="none", offset_order=0))
+    assert config.complete(without)["map"]["offset_order"] == 0
 
 
 @pytest.mark.parametrize("base", ["scans", "scans of {2026}"])
