@@ -1,6 +1,6 @@
 """An analysis: model, candidate effects and data vector; and the task that simulates data vectors."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -12,6 +12,7 @@ from mcsim.datavector import slices as slices_
 from mcsim.datavector.bipolar_scan import BipolarScan, coarse_residuals
 from mcsim.datavector.candidate import Candidate, numbered
 from mcsim.datavector.filter_model import Model, model_of
+from mcsim.datavector.hindrance import hindrance
 from mcsim.datavector.map_checks import check_differ, checked_map
 from mcsim.datavector.matched_filters import differencing_filters, matched_filter
 from mcsim.datavector.settings import DiagnosisSettings
@@ -22,10 +23,8 @@ from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.ensemble.external_maps import Source
 from mcsim.errors import InputError, RunError
 from mcsim.simulation import differencing, sampled, simulate
-from mcsim.simulation.channels import refuse_unseen
 from mcsim.simulation.nuisance import DisturbedSurvey, Nuisance, check_nuisances, nuisances_of
 from mcsim.simulation.survey import Survey, survey
-from mcsim.simulation.timestream import CorrelatedNoise
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import rotation
 from mcsim.support.arrays import Alm, Cl, Map, Vector
@@ -177,7 +176,7 @@ def _candidates(model: Model, kinds: Sequence[tuple[str, type[Effect]]]) -> Iter
         fit = effect.parametrization if name in declared else effect.parametrization.seen_at(frequencies)
         for channel in (None,) if effect.scope == "common" else model.channels:
             for fixed in effect.variants_in(run.map.splits):
-                if _hindrance(model, effect, channel, fixed) is None:
+                if hindrance(model, effect, channel, fixed) is None:
                     columns = tuple(range(len(fit.basis())))
                     yield Candidate(effect, channel, columns, dict(fixed), step=_step(model, effect, channel), fit=fit)
 
@@ -194,41 +193,6 @@ def _declared(run: config.RunConfig) -> set[str]:
     return {systematics.called(one.effect) for one in run.nuisances}
 
 
-def _hindrance(model: Model, kind: type[Effect], channel: str | None, settings: Mapping[str, Any]) -> str | None:
-    """Return why an effect cannot be there, or would change nothing; None if it can be there.
-
-    HookError for one whose hooks fail.
-    """
-    owners = [c for c in model.survey.channels if channel in (None, c.name)]
-    if acts_through(kind, "differencing") and any(owner.side_b is None for owner in owners):
-        return "it acts on differencing, and the scan has none"
-    if acts_through(kind, "excess", "steady_gain") and any(owner.side_b is not None for owner in owners):
-        return "it acts on the samples of one beam, and the scan takes differences of two"
-    drawn = [m.drawn for owner in owners for m in owner.maps]
-    if acts_through(kind, "knee") and not all(isinstance(one, CorrelatedNoise) for one in drawn):
-        return "it moves the knee of noise with memory, and that of the maps has none"
-    if acts_through(kind, "orientations"):
-        scans = [spec.scan for spec in model.survey.config.channels if channel in (None, spec.name)]
-        if not all(isinstance(scan, config.ScanParallelTransport) for scan in scans):
-            return "it acts on the orientations of parallel transport, and the scan has its own"
-        if not any(owner.beam.mmax for owner in owners):
-            return "it acts on orientations, which a circular beam does not show"
-    effect = systematics.basis_of(kind, settings)[0]
-    try:
-        for owner in owners:
-            systematics.tried((effect,), replace(owner.site, lmax=model.lmax))
-            effect.orientations(owner.maps[0].moments, owner.site)
-            refuse_unseen(owner.name, (effect,))
-    except systematics.HookError:
-        raise
-    except InputError as error:
-        return str(error).rstrip(".")
-    quiet = all(m.noise_uk is None for owner in owners for m in owner.maps)
-    if quiet and acts_through(kind, "noise", "excess"):
-        return "it acts on noise, and the maps have none"
-    return None
-
-
 def check_asked(analysis: Analysis, names: Sequence[str]) -> None:
     """Raise InputError for an effect that is asked for and is no candidate, with the reason."""
     missing = sorted(set(names) - {candidate.name for candidate in analysis.candidates})
@@ -236,7 +200,7 @@ def check_asked(analysis: Analysis, names: Sequence[str]) -> None:
         kind = dict(analysis.library)[name]
         places = (None,) if kind.scope == "common" else analysis.model.channels
         variants = kind.variants_in(analysis.run.map.splits)
-        reasons = [_hindrance(analysis.model, kind, place, dict(fixed)) for place in places for fixed in variants]
+        reasons = [hindrance(analysis.model, kind, place, dict(fixed)) for place in places for fixed in variants]
         why = next((reason for reason in reasons if reason is not None), "what is measured does not show it")
         raise InputError(f"effect {name} is asked for, but cannot be found in this model: {why}; leave it out.")
 

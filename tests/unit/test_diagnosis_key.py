@@ -95,8 +95,8 @@ def test_simulations_and_scores_are_made_anew_with_another_library(plugin, monke
 NO_SCORE = {
     *("ensemble", "errors", "stats", "support"),
     *(f"reconstruction.{name}" for name in ("grammar", "search", "structure")),
-    *(f"datavector.{name}" for name in ("bipolar_scan", "campaign", "candidate", "map_checks", "slices", "summaries")),
-    "datavector.settings",
+    *(f"datavector.{name}" for name in ("bipolar_scan", "campaign", "candidate", "hindrance", "map_checks", "slices")),
+    *("datavector.summaries", "datavector.settings"),
 }
 """What is imported where scores of simulations are made, and makes none of them; settings are in the key by value."""
 
