@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -51,11 +52,12 @@ def describe(path: str | Path) -> str:
             looked_at = int((spectra(known, kind)["sigma"] > 0.0).sum())
             rows = list(strongest(known, kind).head(5).itertuples())
         what = "mean of the difference to the control" if paired else "mean"
-        chance = f"the largest of {looked_at} by chance: about {_of_chance(looked_at):.1f} sigma"
-        found += [f"  strongest binned spectra ({what}; {chance}):"] if rows else []
+        if rows:
+            chance = f"the largest of {looked_at} by chance: about {_of_chance(looked_at):.1f} sigma"
+            found.append(f"  strongest binned spectra ({what}; {chance}):")
         for row in rows:
-            bounds = f"l = {row.bin_first}-{row.bin_last}"
-            found.append(f"    {row.pair}  {row.mode:8s} {bounds:14s} {_value(row.value)} uK^2, {row.sigma:.1f} sigma")
+            bounds, value = f"l = {row.bin_first}-{row.bin_last}", _value(row.value, row)
+            found.append(f"    {row.pair}  {row.mode:8s} {bounds:14s} {value} uK^2, {row.sigma:.1f} sigma")
     return "\n".join(found)
 
 
@@ -99,15 +101,21 @@ def _spectra(prediction: xr.Dataset) -> list[str]:
     for pair, mode in zip(best["pair"][:shown], best["mode"][:shown], strict=True):
         for row in rows[(rows["pair"] == pair) & (rows["mode"] == mode)].dropna().itertuples():
             bounds = f"{row.bin_first}-{row.bin_last}"
-            mean, beam = _value(row.value), _value(row.beam)
+            mean, beam = _value(row.value, row), _value(row.beam, row)
             text.append(f"    {pair:<16} {mode:<9} {bounds:<11} {mean:>22} {row.error:>10.3g} {beam:>22}")
     if len(best) > shown:
         text.append(f"    and {len(best) - shown} weaker spectra: write all with -o FILE.ecsv")
     return text
 
 
-def _value(value: complex) -> str:
-    """Return a coefficient with four digits, without the part that vanishes identically, but for rounding."""
-    if abs(value.imag) <= ROUNDING * abs(value):
-        return f"{value.real:.4g}"
-    return f"{value:.4g}" if abs(value.real) > ROUNDING * abs(value) else f"{value.imag:.4g}j"
+def _value(value: complex, row: Any) -> str:
+    """Return a coefficient of a row's mode with four digits, without the part that vanishes, but for rounding.
+
+    At M = 0 that is the imaginary part at even parity, and the real one at odd parity, for maps are real.
+    """
+    real, imaginary = (abs(part) > ROUNDING * abs(value) for part in (value.real, value.imag))
+    if row.M == 0:
+        real, imaginary = (row.L + row.d) % 2 == 0, (row.L + row.d) % 2 == 1
+    if real and imaginary:
+        return f"{value:.4g}"
+    return f"{value.imag:.4g}j" if imaginary else f"{value.real:.4g}"

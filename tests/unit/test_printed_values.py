@@ -5,10 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import mcsim
 from mcsim import systematics
 from mcsim.datavector.candidate import Candidate
 from mcsim.diagnosis import words
 from mcsim.diagnosis.assemble import effects_of
+from mcsim.ensemble.describe import describe_prediction
 from mcsim.support.numbers import duration, measured, number, probability
 
 
@@ -87,3 +89,15 @@ def test_a_reduction_that_no_effect_can_make_is_said_so(files, why):
     """Further structures are what the first one leaves: without an effect of that, none is added."""
     found = tuple(SimpleNamespace(sentence="Something.", file=file) for file in files)
     assert why in words.unlisted(SimpleNamespace(unlisted=found, unlisted_held_out=None))[-1]
+
+
+def test_coefficients_that_are_real_are_printed_without_what_rounding_leaves():
+    """At M = 0 even parity is real and odd parity imaginary, whatever the size of the other part."""
+    expected = mcsim.predict("tiny")
+    plain = describe_prediction(expected)
+    assert "j" not in plain
+    for name in ("biposh_binned_mean", "biposh_difference_binned_mean"):
+        expected[name] = expected[name] * (1.0 + 1e-9j)
+    assert describe_prediction(expected) == plain
+    swapped = expected.assign_coords(d=expected.d + 1)
+    assert "j" in describe_prediction(swapped)
