@@ -1,6 +1,7 @@
 """Surveys with a user's own effects, and with nuisances that are such effects."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from mcsim import config, systematics
 from mcsim.simulation import simulate
 from mcsim.simulation.nuisance import DisturbedSurvey, tables
 from mcsim.simulation.survey import survey
+from mcsim.systematics import Site
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,3 +81,8 @@ def test_a_nuisance_acts_as_the_effect_that_is_drawn(kind):
     expected = simulate.maps(survey(acting, library=library), 1)
     np.testing.assert_allclose(found, expected, atol=1e-9)
     assert np.abs(found[2:] - simulate.maps(survey(replace(run, nuisances=())), 1)[2:]).max() > 1.0
+
+
+def test_the_page_on_effects_lists_what_a_hook_can_know_of_its_site():
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "effect.md").read_text("utf-8")
+    assert [one.name for one in fields(Site) if f"\n| `{one.name}` |" not in page] == []
