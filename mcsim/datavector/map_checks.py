@@ -150,6 +150,16 @@ def _warn_of_others(names: Iterable[str]) -> None:
         )
 
 
+def warn_of_no_noise(model: Model) -> None:
+    """Warn of maps of a model that have no noise, where the data may have some."""
+    if found := [m.name for channel in model.survey.channels for m in channel.maps if m.noise_uk is None]:
+        warnings.warn(
+            f"the model has no noise in {some(found, 3)}, so that noise of the data is a gap that no effect explains; "
+            "give the channel noise (noise.sigma0_uk or noise.depth_uk_arcmin above 0), unless the data have none.",
+            stacklevel=3,
+        )
+
+
 def check_differ(model: Model, maps: Sequence[Map], names: Sequence[str]) -> None:
     """Raise InputError for two maps that are the same although both have noise of their own: one is a copy."""
     noisy = [m.noise_uk is not None for channel in model.survey.channels for m in channel.maps]

@@ -18,7 +18,7 @@ from mcsim.datavector.analysis import Analysis, Job, analysis_of, check_asked, d
 from mcsim.datavector.campaign import asking, batch
 from mcsim.datavector.candidate import TemplateBank
 from mcsim.datavector.kept import Kept
-from mcsim.datavector.map_checks import check_pixels, checked_maps, given_maps, of_pixel_means
+from mcsim.datavector.map_checks import check_pixels, checked_maps, given_maps, of_pixel_means, warn_of_no_noise
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.seeds import Checked
 from mcsim.datavector.settings import DiagnosisSettings
@@ -242,6 +242,8 @@ def _analysed(
     if table is None:
         check_pixels(analysis.model, analysis.elements)
     power.check(analysis.model.survey)
+    if given and source is None:
+        warn_of_no_noise(analysis.model)
     return run, analysis, table, given
 
 

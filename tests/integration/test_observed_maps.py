@@ -84,6 +84,13 @@ def test_what_cannot_be_done_is_said_before_anything_is_learned(small, folder):
     assert not (folder / "new").exists()
 
 
+def test_a_model_without_noise_is_told_before_anything_is_learned(small, folder):
+    """Real data have some, and end in a gap of which nothing can be said."""
+    quiet = replace(small.run, channels=tuple(one.without_noise() for one in small.run.channels))
+    with pytest.warns(UserWarning, match="V1:half1.*noise.sigma0_uk"):
+        api.describe(quiet, DiagnosisSettings(), folder)
+
+
 def test_maps_are_read_as_they_were_written(small, folder):
     maps = read_maps(small.model, folder)
     expected = simulate.maps(data_of(small.run), 0)
