@@ -49,11 +49,13 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     # An order of the maps in which the model fits says more than any effects, but for a single one.
     exchanged = [] if found.explanations and len(found.explanations[0].members) == 1 else data.exchanged
     notes, refusals = [*in_words(data.context), *data.notes()], list[str]()
-    if not exchanged and found.explanations:
-        found, refusals = agreeing(data, refined, found)
+    if not exchanged:
+        if found.explanations:
+            found, refusals = agreeing(data, refined, found)
         if (beside := with_rivals(data, refined, found)) is not None:
-            data, refined = beside
-            found, refusals = agreeing(data, refined, refined.attribution.if_named(data.context.settings))
+            again, refused = agreeing(*beside, beside[1].attribution.if_named(data.context.settings))
+            if again.explanations or found.explanations:
+                (data, refined), found, refusals = beside, again, refused
     context, detected = data.context, refined.partial
     if exchanged:
         found, detected = found.unexplained(), None

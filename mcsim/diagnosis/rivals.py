@@ -1,12 +1,14 @@
-"""Try effects that are proposed on request alone in the place of those that are about to be named."""
+"""Try effects that are proposed on request alone in the place of those that are about to be named, or of none."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from mcsim.datavector.analysis import on_request
+from mcsim.datavector.bent import bent_templates
 from mcsim.datavector.candidate import Candidate, beyond, columns_of, numbered, scatters_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
@@ -15,41 +17,69 @@ from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.selection import Attribution
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
+from mcsim.systematics import if_possible
+
+CLEAR = 1e-6  #: global p-value up to which effects on request are tried where no other explains a gap: it is no chance
+MUCH = 0.4  #: share of the excess chi^2 that one of them explains alone then, before it is simulated at its amplitude
 
 
 def with_rivals(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[DataSet[Any], Refined] | None:
-    """Return data and attribution with the effects on request that explain the data like the only set to be named.
+    """Return data and attribution with the effects on request that explain the data like sets that are to be named.
 
-    None if there are several sets, or no such effects.
+    Where nothing else explains a clear gap, they are those that explain much of it alone. None if there are none.
 
     Notes
     -----
     As a candidate each of them would raise the bar for all. Here it becomes a candidate for these data alone, and only
-    if it can take the place of a member, in the data vector and in the numbers beside it. Global p-values stay those of
-    the candidates that are always proposed. It is simulated at the amplitude that it has there, as a member was.
-    Patterns that are drawn are no rivals.
+    if it can take the place of members of a set, in the data vector and in the numbers beside it: of several members,
+    or, of the only set, of a single one. Global p-values stay those of the candidates that are always proposed. It is
+    simulated at the amplitude that it has there, as a member was. Patterns that are drawn are no rivals.
     """
-    context = data.context
-    if len(found.explanations) != 1:
+    context, settings = data.context, data.context.settings
+    sets = [one.members for one in found.explanations[: settings.compared_sets]]
+    least = 1 if len(sets) == 1 else 2
+    if max(map(len, sets), default=0) < least and (sets or found.faint or found.gap.pvalue > CLEAR):
         return None
-    channels = {context.candidates[member].channel for member in found.explanations[0].members}
+    channels = {context.candidates[member].channel for members in sets for member in members}
     others = [one for one in on_request(context.analysis) if not one.random_response]
-    near = [one for one in others if one.channel in channels or None in (one.channel, *channels)]
-    known = list(data.responses(near, context.settings.channel_skies))
-    null, z, t = _widest(data, refined, found.explanations[0].members)
-    wide = replace(refined, attribution=found, templates=t)
-    places = list(in_place(null, z, wide, known, context.settings))
+    near = [one for one in others if not sets or one.channel in channels or None in (one.channel, *channels)]
+    known = list(data.responses(near, settings.channel_skies))
+    bent = dict(_alone(data, known)) if not sets else {}
+    places: list[tuple[int, tuple[int, ...]]] = [(rival, ()) for rival in bent]
+    for members in sets:
+        null, z, t = _widest(data, refined, members)
+        wide = replace(refined, templates=t)
+        places += [one for one in in_place(null, z, wide, members, known, settings, least) if one not in places]
     if not places:
         return None
-    data = replace(data, context=with_candidates(context, [known[rival] for rival, _ in places]))
-    added = data.context.templates[:, context.templates.shape[1] :]
-    candidates = (*refined.candidates, *data.context.candidates[len(context.candidates) :])
-    members = found.explanations[0].members
-    sets = [
-        (*(one for one in members if one != member), len(context.candidates) + k)
-        for k, (_, member) in enumerate(places)
-    ]
-    return data, Refiner(data).run(np.concatenate([refined.templates, added], axis=1), candidates, sets)
+    chosen = list(dict.fromkeys(rival for rival, _ in places))
+    data = replace(data, context=with_candidates(context, [known[rival] for rival in chosen]))
+    added, first = data.context.templates[:, context.templates.shape[1] :], len(context.candidates)
+    straight, start = (np.concatenate([refined.templates, *own], axis=1) for own in ([added], bent.values() or [added]))
+    candidates = (*refined.candidates, *data.context.candidates[first:])
+    tried = [(*kept, first + chosen.index(rival)) for rival, kept in places]
+    return data, Refiner(data).run(straight, candidates, tried, start)
+
+
+def _alone(data: DataSet[Any], rivals: Sequence[tuple[Candidate, Matrix]]) -> Iterator[tuple[int, Matrix]]:
+    """Yield rivals that explain much of the excess alone, with their templates, bent where the response is.
+
+    Products of what a strong gain or signal adds to maps grow with the square of its amplitude.
+    """
+    context, gap, size = data.context, data.gap, len(data.x)
+    for index, (rival, response) in enumerate(rivals):
+        (own,), t = numbered([rival]), response[:size]
+        curvature = np.zeros_like(t)
+        for column, (effect, step) in enumerate(zip(rival.basis, rival.steps, strict=True)):
+            with if_possible():
+                pair = [rival.table(one) for one in (effect, effect.inverse())]
+                changes = [data.respond_extended([one], context.settings.channel_skies).mean(axis=0) for one in pair]
+                curvature[:, column] = sum(changes)[:size] / (2.0 * step**2)
+        # What was measured at a step ahead has the bent part of it.
+        t = bent_templates(context.null, data.x, t - curvature * rival.steps, curvature, [own])
+        fit = context.null.fit(data.x, t)
+        if fit.delta_chi2 >= MUCH * (gap.chi2 - gap.dimension) and np.isfinite(beyond([own], (0,), fit)):
+            yield index, t
 
 
 def _widest(data: DataSet[Any], refined: Refined, members: Sequence[int]) -> tuple[SimulatedGaussian, Vector, Matrix]:
@@ -69,29 +99,31 @@ def in_place(
     null: SimulatedGaussian,
     z: Vector,
     refined: Refined,
+    members: Sequence[int],
     rivals: Sequence[tuple[Candidate, Matrix]],
     settings: DiagnosisSettings,
-) -> Iterator[tuple[int, int]]:
-    """Yield the indices of rivals, with their responses, that explain data in the place of a member of the only set.
+    least: int = 1,
+) -> Iterator[tuple[int, tuple[int, ...]]]:
+    """Yield the indices of rivals, with their responses, that explain data in the place of members of a set.
 
-    With each stands the member.
-
-    Amplitudes are possible, and the likelihood is within ``odds_cut`` of that of the set, but for an error of the
-    response that is tolerated (``consistency_error``). Data and templates are those of ``null``.
+    With each stand the members that are kept, as few as possible: ``least`` go at least. Amplitudes are possible, and
+    the likelihood is within ``odds_cut`` of that of the set, but for an error of the response that is tolerated
+    (``consistency_error``). Data and templates are those of ``null``.
     """
-    candidates, members = refined.candidates, refined.attribution.explanations[0].members
+    candidates = refined.candidates
     whole = null.fit(z, refined.templates[:, columns_of(candidates, members)])
-    least = float(null.log_likelihood(whole.chi2)) - np.log(settings.odds_cut)
+    lowest = float(null.log_likelihood(whole.chi2)) - np.log(settings.odds_cut)
+    fewer = [kept for size in range(len(members) - least + 1) for kept in combinations(members, size)]
     for index, (rival, response) in enumerate(rivals):
         every = numbered([*candidates, rival])
         t = np.concatenate([refined.templates, response[: len(z)]], axis=1)
-        for member in members:
-            changed = (*(one for one in members if one != member), len(candidates))
+        for kept in fewer:
+            changed = (*kept, len(candidates))
             columns = columns_of(every, changed)
             fit = null.fit(z, t[:, columns])
             wrong = settings.consistency_error * null.expected_snr(t[:, columns] @ fit.amplitudes)
-            if null.log_likelihood(fit.chi2) + 0.5 * wrong**2 >= least and np.isfinite(beyond(every, changed, fit)):
-                yield index, member
+            if null.log_likelihood(fit.chi2) + 0.5 * wrong**2 >= lowest and np.isfinite(beyond(every, changed, fit)):
+                yield index, kept
                 break
 
 

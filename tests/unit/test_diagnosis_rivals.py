@@ -50,7 +50,7 @@ def named() -> SimpleNamespace:
 def test_what_leaves_as_little_is_a_rival(named, cosine, channel, sign, is_rival):
     response = cosine * named.t[:, [1]] + np.sqrt(1.0 - cosine**2) * named.t[:, [4]]
     rivals = [(candidate("other", channel, sign), response)]
-    assert list(in_place(named.null, named.x, named.refined, rivals, DiagnosisSettings())) == [(0, 1)] * is_rival
+    assert list(in_place(named.null, named.x, named.refined, (1,), rivals, DiagnosisSettings())) == [(0, ())] * is_rival
 
 
 @pytest.mark.parametrize(("beside", "is_rival"), [(0.0, False), (1.0, True)])
@@ -64,7 +64,18 @@ def test_numbers_beside_the_data_vector_tell_a_rival_from_a_member(named, beside
     refined = replace(named.refined, templates=np.concatenate([named.refined.templates, t]))
     response = np.concatenate([named.t[:, [1]], beside * t[:, [1]]])
     rivals = [(candidate("other", "V1"), response)]
-    assert list(in_place(null, z, refined, rivals, DiagnosisSettings())) == [(0, 1)] * is_rival
+    assert list(in_place(null, z, refined, (1,), rivals, DiagnosisSettings())) == [(0, ())] * is_rival
+
+
+def test_a_rival_takes_the_place_of_as_many_members_as_it_can(named):
+    """Alone, if it explains what two do; else beside one of them, unless it has to replace both."""
+    settings, three = DiagnosisSettings(), named.refined
+    x = named.x + S * named.t[:, 0]
+    both = named.t[:, [0]] + named.t[:, [1]]
+    rivals = [(candidate("both", "V1"), both), (candidate("one", "V1"), named.t[:, [1]])]
+    found = list(in_place(named.null, x, three, (0, 1), rivals, settings))
+    assert found == [(0, ()), (1, (0,))]
+    assert list(in_place(named.null, x, three, (0, 1), rivals, settings, least=2)) == [(0, ())]
 
 
 def test_columns_are_added_behind_those_of_a_bank():

@@ -286,7 +286,9 @@ def true(number):
                 named, counted = found, [*counted, *row]
                 if len(found.explanations) == 1:
                     refined = Refined(found, t, known.candidates, t)
-                    if near := [rivals[index] for index, _ in in_place(null, seen, refined, rivals, known.settings)]:
+                    members = found.explanations[0].members
+                    places = in_place(null, seen, refined, members, rivals, known.settings)
+                    if near := [rivals[index] for index, _ in places]:
                         more = with_candidates(known, near)
                         named = attribute(more.null, x, more.templates, more.candidates, more.calibration)
                         counted[-4:] = said(named.if_named(more.settings), more, member.identity)
