@@ -118,8 +118,8 @@ class Templates:
 
     def beyond_leading(self, model: Model, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the approximate difference between all orders and the leading one at theta, shape (p,)."""
-        factor = theta @ self.functions(model)
-        return self.data(factor, True, TRIAL_MOMENTS) - self.data(factor, False, TRIAL_MOMENTS)
+        factor, degree = theta @ self.functions(model), max(TRIAL_MOMENTS, *(mode.L for mode in self.measured.modes))
+        return self.data(factor, True, degree) - self.data(factor, False, degree)
 
 
 def templates(survey: Survey, measured: Measurement, nthreads: int = 1) -> Templates:

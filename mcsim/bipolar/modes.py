@@ -70,6 +70,13 @@ def check_modes(modes: Iterable[Indices]) -> None:
             raise InputError(f"mode L={L}, M={M}, d={d} does not exist; |M| and |d| must not exceed L.")
 
 
+def check_degree(modes: Iterable[Indices], L_max: int, name: str) -> None:
+    """Raise InputError for a mode above ``L_max``, where coefficients that ``name`` names in messages end."""
+    highest = max((L for L, _, _ in modes), default=0)
+    if highest > L_max:
+        raise InputError(f"{name} end at L = {L_max}, below L = {highest} of a mode; compute them further.")
+
+
 def existing(L: int, d: int, lmax: int) -> NDArray[np.bool_]:
     """Return True where A^{LM}_{l2-d, l2} exists, l2 = 0..lmax: 0 <= l1 <= lmax and |l1 - l2| <= L <= l1 + l2."""
     l2 = np.arange(lmax + 1)

@@ -173,13 +173,19 @@ def _orientations(
 
 
 def moments_needed(survey: Survey, exact: bool, L_moments: int | None = None) -> int:
-    """Return the degree up to which a prediction needs the moments: ``L_moments`` to all orders, and with weights."""
+    """Return the degree up to which a prediction needs the moments: ``L_moments`` to all orders, and with weights.
+
+    Raise InputError for one below biposh.L_max, from where on there would be no signal.
+    """
     weights = [m.weight for m in survey.maps if _weighted(survey, m).weight is not None]
+    L_max = survey.config.biposh.L_max
+    if L_moments is not None and L_moments < L_max:
+        raise InputError(f"L_moments = {L_moments} is below biposh.L_max = {L_max}; give L_moments >= {L_max}.")
     if not (exact or weights):
-        return survey.config.biposh.L_max
+        return L_max
     if L_moments is not None:
         return L_moments
-    return max((_degrees_of(weight) for weight in weights if weight is not None), default=L_MOMENTS)
+    return max(L_max, max((_degrees_of(weight) for weight in weights if weight is not None), default=L_MOMENTS))
 
 
 def _degrees_of(weight: Map) -> int:
@@ -298,7 +304,8 @@ def _of_steps_in_harmonics(
             row[l2] *= window[l2 - d] * window[l2]
         return found
     _check_even(m, power, window, weight)
-    ell, w = np.arange(window.size), map_harmonics(weight, _degrees_of(weight))
+    ell, L_max = np.arange(window.size), max(_degrees_of(weight), *(L for L, _, _ in modes))
+    w = map_harmonics(weight, L_max)
     even = ScannedBeam(np.sqrt((2.0 * ell + 1.0) / (4.0 * np.pi))[None], w[None])
     return cmb_biposh_leading(modes, power[weight != 0.0].mean() * window**2, lmax, even, nthreads=nthreads)
 

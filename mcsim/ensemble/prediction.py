@@ -61,8 +61,8 @@ def predict(
         per bin, and ``_total`` of all maps jointly.
     L_moments
         Highest degree of the orientation moments if ``exact``, and of weights of pixels, such as masks; see
-        :func:`mcsim.bipolar.theory.cmb_biposh_exact`. Default: 64; with weights up to 192, until it holds 99 % of
-        their square.
+        :func:`mcsim.bipolar.theory.cmb_biposh_exact`. At least biposh.L_max, which is enough without these two, and
+        then taken whatever is given. Default: 64; with weights up to 192, until it holds 99 % of their square.
     nthreads
         Number of threads.
     workers

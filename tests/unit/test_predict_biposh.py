@@ -216,6 +216,13 @@ def test_user_errors():
     beam = ScannedBeam(circular(np.ones(5)), parallel_transport_harmonics(1, 2))
     with refused("L=1", "M=2", "d=0"):
         beam_biposh(beam, (1, 2, 0), 4)
+    for kind in (cmb_biposh_leading, cmb_biposh_exact):
+        with refused("L = 2", "L = 3"):
+            kind([(2, 0, 0), (3, 0, 1)], np.ones(5), 4, beam)
+    with refused("L = 2", "L = 3"):
+        beam_biposh(beam, (3, 0, 1), 4)
+    with refused("L = 1", "L = 2"):
+        noise_biposh([(0, 0, 0), (2, 0, 0)], np.zeros((2, 3), dtype=complex), 4)
     with refused("ell = 3", "lmax", 4):
         cmb_biposh_leading([(2, 0, 0)], np.ones(4), 4, beam)
     with refused("ell = 3", "lmax", 4):

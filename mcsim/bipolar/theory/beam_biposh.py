@@ -1,11 +1,12 @@
 """Beam-BipoSH B^{LM}_{l1 l2}: a non-circular beam under any scan in the bipolar spherical-harmonic basis."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.bipolar.modes import Indices, check_modes, existing
+from mcsim.bipolar.modes import Indices, check_degree, check_modes, existing
 from mcsim.bipolar.theory.harmonics import negative_spin
 from mcsim.errors import InputError
 from mcsim.sphere.checks import check_finite, check_whole
@@ -38,11 +39,13 @@ class ScannedBeam:
         check_finite(self.blm, "blm")
         check_finite(self.w, "w")
 
-    def check(self, lmax: int) -> None:
-        """Raise InputError unless the beam reaches ``lmax``."""
+    def check(self, lmax: int, modes: Sequence[Indices]) -> None:
+        """Raise InputError unless the beam reaches ``lmax``, and the moments the degree L of every mode."""
         check_whole(lmax, "lmax")
+        check_modes(modes)
         if self.blm.shape[1] <= lmax:
             raise InputError(f"the beam ends at l = {self.blm.shape[1] - 1}, below lmax {lmax}; compute it further.")
+        check_degree(modes, self.L_max, "the moments w_s")
 
     @property
     def weighted(self) -> bool:
@@ -88,7 +91,7 @@ def beam_biposh(beam: ScannedBeam, mode: Indices, lmax: int) -> NDArray[np.compl
     """Return B^{LM}_{l2-d, l2} of a beam under any scan at l2 = 0..lmax, complex, NaN where it does not exist.
 
     The mode is (L, M, d), with d = l2 - l1 of either sign and any |M| <= L; lmax is the highest l1 and l2. Raise
-    InputError if |M| or |d| exceeds L.
+    InputError if |M| or |d| exceeds L, or the moments end below L.
 
     Notes
     -----
@@ -97,18 +100,16 @@ def beam_biposh(beam: ScannedBeam, mode: Indices, lmax: int) -> NDArray[np.compl
     random complex beams with odd m and orientations without symmetry (tests/unit/test_predict_brute_force.py). A
     circular beam gives (-1)^l B_l sqrt(2l+1) for L = 0 and nothing else.
     """
-    check_modes([mode])
-    beam.check(lmax)
+    beam.check(lmax, [mode])
     L, M, d = mode
     l2 = np.arange(lmax + 1)
     exists = existing(L, d, lmax)
     total = np.zeros(lmax + 1, dtype=np.complex128)
-    if beam.L_max >= L:
-        response, orientations = beam.response(lmax), beam.orientations()
-        top = min(beam.smax, L)
-        for s in range(-top, top + 1):
-            w = orientations[beam.smax + s, L, beam.L_max + M]
-            total += w * response[beam.smax + s] * _spin_coupling(L, d, s, lmax)
+    response, orientations = beam.response(lmax), beam.orientations()
+    top = min(beam.smax, L)
+    for s in range(-top, top + 1):
+        w = orientations[beam.smax + s, L, beam.L_max + M]
+        total += w * response[beam.smax + s] * _spin_coupling(L, d, s, lmax)
     norm = np.sqrt(np.where(exists, (2.0 * l2 + 1) * (2.0 * (l2 - d) + 1), 0.0) / (4 * np.pi))
     return np.where(exists, (-1) ** d * norm * total, np.nan)
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.bipolar.modes import Indices, bennett_factor, check_modes, existing
+from mcsim.bipolar.modes import Indices, bennett_factor, check_degree, check_modes, existing
 from mcsim.bipolar.theory.beam_biposh import ScannedBeam, beam_biposh
 from mcsim.sphere.checks import check_cl, check_shape, check_whole
 from mcsim.sphere.wigner import sixj_family, threej_family
@@ -31,7 +31,7 @@ def cmb_biposh_leading(
     """Return the mean A^{LM}_{l1 l2} of modes (L, M, d), with |M|, |d| <= L, to leading order.
 
     Weights of pixels are taken as by :func:`cmb_biposh_exact`, with ``nthreads``. Raise InputError if a mode cannot
-    exist, or spectrum or beam end below lmax.
+    exist, spectrum or beam end below lmax, or moments below L.
 
     Notes
     -----
@@ -69,7 +69,7 @@ def cmb_biposh_exact(
     L = 0 gives (-1)^l sqrt(2l+1) C_l with the second order of the beam. Include any power above ``lmax`` in ``cl``: it
     leaks down. The sums over L1, L2 end at the L_max of the moments of the beams; threads share the blocks of ell.
     Maps whose pixels have weights W_x, W_y are not divided by <W_x W_y>, and their own BipoSH is in the result. Raise
-    InputError if a mode cannot exist, or spectrum or beam end below lmax.
+    InputError if a mode cannot exist, spectrum or beam end below lmax, or moments below L.
 
     Notes
     -----
@@ -129,7 +129,7 @@ def noise_biposh(modes: Sequence[Indices], variance: NDArray[np.complex128], lma
     """Return the mean A^{LM}_{l1 l2} of white noise of uneven variance; zero for odd parity.
 
     The variance is given by the coefficients v_LM, any M, of (pixel variance) x (pixel area) in uK^2 sr, shape (L_max +
-    1, 2 L_max + 1), ``variance[L, L_max + M]``.
+    1, 2 L_max + 1), ``variance[L, L_max + M]``. Raise InputError if they end below the L of a mode.
 
     Notes
     -----
@@ -141,9 +141,10 @@ def noise_biposh(modes: Sequence[Indices], variance: NDArray[np.complex128], lma
     check_whole(lmax, "lmax")
     L_max = len(variance) - 1
     check_shape(variance, (L_max + 1, 2 * L_max + 1), "the variance")
+    check_degree(modes, L_max, "the coefficients of the variance")
     result = np.full((len(modes), lmax + 1), np.nan, dtype=np.complex128)
     for row, (L, M, d) in zip(result, modes, strict=True):
-        v = variance[L, L_max + M] if L_max >= L else 0.0
+        v = variance[L, L_max + M]
         exists = existing(L, d, lmax)
         row[exists] = v / np.sqrt(4 * np.pi) / bennett_factor((L, M, d), lmax)[exists] if (L + d) % 2 == 0 else 0.0
     return result
@@ -154,12 +155,11 @@ def _checked(
 ) -> tuple[ScannedBeam, ScannedBeam]:
     """Return both beams, with the moments that count.
 
-    Raise InputError for modes that cannot exist, or a spectrum or beam that ends below lmax.
+    Raise InputError for modes that cannot exist, a spectrum or beam that ends below lmax, or moments that end below L.
     """
-    check_modes(modes)
     check_cl(cl, lmax)
     for beam in (x, x if y is None else y):
-        beam.check(lmax)
+        beam.check(lmax, modes)
     top = lmax + len(cl) - 1  # L1 <= l1 + l
     cut = x.within(top)
     return cut, cut if y is None or y is x else y.within(top)
