@@ -73,7 +73,7 @@ class Source(ABC):
 
 
 def in_order(given: Any, parts: Sequence[Part], where: str) -> list[Map]:
-    """Return maps in the order of the parts, uK; InputError if one is missing, or is no array of numbers.
+    """Return maps in the order of the parts, uK; InputError for one missing, given twice or no array of numbers.
 
     ``given``: mappings, xarray objects, or both nested: channel, then split. Names may be ``W1:half1``, ``W1/half1`` or
     ``W1_half1``. An attribute ``units`` says another unit; ``frame`` and ``ordering`` are those of the parts and RING,
@@ -82,11 +82,13 @@ def in_order(given: Any, parts: Sequence[Part], where: str) -> list[Map]:
     names = {alias: part for part in parts for alias in (part.name, *(part.name.replace(":", s) for s in "/_"))}
     if len(parts) == 1:
         names[""] = parts[0]
-    found = {}
+    found: dict[str, Map] = {}
     for labels, one in _flat(given):
-        part = names.get(":".join(labels))
+        part = names.get(label := ":".join(labels))
         if part is not None:
             name = f"the map {part.name} of {where}"
+            if part.name in found:
+                raise InputError(f"{name} is given twice, the second time as {label!r}; give each map under one name.")
             found[part.name] = in_uk(one, name, part.frame, part.frequency_ghz)
     missing = [part.name for part in parts if part.name not in found]
     if missing:
@@ -121,6 +123,7 @@ def _flat(given: Any, labels: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str,
 def in_uk(one: Any, name: str, frame: str, frequency_ghz: float | None) -> Map:
     """Return a given map in uK, ``healpy.UNSEEN`` where not observed; its attribute ``units`` may say another unit.
 
+    Values that are not finite stay so: they do not say that a pixel was not observed, and diagnoses refuse them.
     ``name`` names it in messages. InputError for no array of numbers, or if its attributes ``frame`` or ``ordering``
     say another frame or another order than RING.
     """

@@ -62,6 +62,15 @@ def test_maps_of_another_frame_or_order_are_refused() -> None:
             in_order({"V": map_.assign_attrs({attribute: value})}, PARTS, "run.zarr")
 
 
+@pytest.mark.parametrize("other", ["V_a", "V/a"])
+def test_a_map_that_is_given_under_two_names_is_refused(other: str) -> None:
+    """The last one was taken."""
+    parts, map_ = (Part("V:a", "V", "a", None, "galactic"),), np.arange(12.0)
+    for twice in ({"V:a": map_, other: 2.0 * map_}, {"V": {"a": map_}, other: map_}, {other: map_, "V:a": map_}):
+        with refused("V:a", f"'{list(twice)[1]}'", "run.zarr"):
+            in_order(twice, parts, "run.zarr")
+
+
 def test_a_simulator_that_works_in_place_is_given_the_same_sky_and_effects_again() -> None:
     """With a sky that was smoothed once more for each call, a modulation of 0.2 was no longer found."""
 
