@@ -114,11 +114,13 @@ def source_of(run: config.RunConfig, given: Any) -> Source:
 def seed_of(seed: int, realization: int) -> int:
     """Return the seed below 2^32 of one realization of a stream: no two are the same, or within a few of each other.
 
-    Simulators add small numbers to a seed (one for each detector), so that neighbours would share noise.
+    Simulators add small numbers to a seed (one for each detector), so that neighbours would share noise. Streams of
+    different seeds start at random, so that N realizations of two have one in common with a probability of N / 2^31.
     """
     if not 0 <= realization < SEEDS:
         raise InputError(f"realization {realization} has no seed; there are {SEEDS} of a stream.")
-    return (seed * SEEDS + realization) * _GOLDEN % (1 << 32)
+    start = int(np.random.SeedSequence(seed).generate_state(1)[0])
+    return (start + realization * _GOLDEN) % (1 << 32)
 
 
 def _code(parts: tuple[Part, ...], label: str, made: bytes, given: Any) -> Code:

@@ -16,7 +16,7 @@ import mcsim
 from mcsim import cli, config
 from mcsim.datavector import campaign
 from mcsim.diagnosis import api
-from mcsim.ensemble.external import seed_of, source_of
+from mcsim.ensemble.external import source_of
 from mcsim.ensemble.external_maps import in_order, parts_of, stacked
 from mcsim.ensemble.maps import write_map
 from mcsim.errors import RunError
@@ -319,13 +319,6 @@ def test_a_class_is_made_with_the_description():
     assert [maps[0] for maps in source.maps(0, 0)] == [SIGMA, SIGMA]
     busier = replace(config.load(MODEL), compute=config.Compute(workers=5))
     assert source_of(busier, Told).content == source.content
-
-
-def test_seeds_are_unique_and_far_apart():
-    seeds = np.sort([seed_of(stream, r) for stream in (campaign._COVARIANCE, campaign._RESPONSE) for r in range(5000)])
-    assert seeds[0] >= 0
-    assert seeds[-1] < 2**32
-    assert np.diff(seeds).min() > 1000
 
 
 def diagnosed(simulator, **changes):

@@ -10,8 +10,9 @@ import pytest
 import xarray as xr
 
 from mcsim import config
+from mcsim.datavector import campaign
 from mcsim.datavector.repeats import check_alike
-from mcsim.ensemble.external import source_of
+from mcsim.ensemble.external import SEEDS, seed_of, source_of
 from mcsim.ensemble.external_maps import Part, fits_maps, in_order
 from mcsim.errors import RunError
 from refusals import refused
@@ -148,6 +149,21 @@ def test_a_realization_that_lacks_a_map_is_not_left_out_in_silence(lost: str, tm
     (tmp_path / lost).unlink()
     with refused(tmp_path / lost, lost[0], 2):
         fits_maps(parts, str(tmp_path / "{channel}_{realization}.fits"))
+
+
+def test_seeds_are_unique_and_far_apart() -> None:
+    seeds = np.sort([seed_of(stream, r) for stream in (campaign._COVARIANCE, campaign._RESPONSE) for r in range(5000)])
+    assert seeds[0] >= 0
+    assert seeds[-1] < 2**32
+    assert np.diff(seeds).min() > 1000
+    every = [seed_of(stream, r) for stream in (campaign._COVARIANCE, campaign._RESPONSE) for r in range(SEEDS)]
+    assert np.unique(every).size == 2 * SEEDS
+
+
+def test_seeds_depend_on_every_bit_of_the_run() -> None:
+    """They were those of its seed modulo 4096."""
+    starts = [seed_of(1 + (1 << bit), 0) for bit in range(1, 63)]
+    assert len({seed_of(1, 0), *starts}) == 63
 
 
 def in_a_pool(seed: int, effects: Any = ()) -> dict[str, Any]:
