@@ -1,5 +1,7 @@
 """Errors of a survey's BipoSH under isotropy, and the signal to noise of the beams' BipoSH."""
 
+from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,7 @@ from mcsim.bipolar.modes import Mode, existing
 from mcsim.bipolar.theory import (
     FULL_SKY,
     Overlap,
+    ScannedBeam,
     Spectra,
     fisher_information,
     isotropic_variance,
@@ -121,27 +124,69 @@ def variables(survey: Survey, found: dict[tuple[int, int], Means], joint: float)
     }
 
 
-def joint_signal_to_noise(survey: Survey, found: dict[tuple[int, int], Means]) -> float:
-    """Return the root of the Fisher information of all maps; infinite for several without noise.
+def joint_signal_to_noise(survey: Survey, beams: Sequence[ScannedBeam], found: dict[tuple[int, int], Means]) -> float:
+    """Return the root of the Fisher information of all maps, whose beams are ``beams``.
 
     Degrees at which masks and the orders of beams that are left out leave no covariance are left out.
+
+    Notes
+    -----
+    Maps without noise have the covariance C_l = c c^t over maps, c the circular beams times the root of the sky's
+    spectrum, and an effect changes it by dc c^t + c dc^t. Where dc is c times a factor that all maps share, this stays
+    in the range of C, and the information is Tr[C^+ dC C^+ dC]/2: that of one of the maps, of which each other is a
+    multiple at every l. Otherwise combinations without power get some, and it is infinite. So one counts of the maps
+    without noise that share weights, orientations and b_ls/b_l0 (or have circular beams), and nothing hides other
+    orientations or shapes where both maps see the sky.
     """
-    size, lmax = len(survey.map_names), survey.lmax
-    if sum(m.noise_uk is None or not m.noise_uk.any() for m in survey.maps) > 1:
-        return float("inf")
-    stored = survey.estimator.modes
+    quiet = [index for index, m in enumerate(survey.maps) if m.noise_uk is None or not m.noise_uk.any()]
+    repeated = set()
+    for x, y in combinations(quiet, 2):
+        if not _seen_alike(survey, beams, x, y):
+            return float("inf")
+        here, there = (np.ones(1) if (w := survey.maps[i].weight) is None else w for i in (x, y))
+        if np.array_equal(here, there):
+            repeated.add(y)
+    place = {index: n for n, index in enumerate(index for index in range(len(survey.maps)) if index not in repeated)}
+    stored, size, lmax = survey.estimator.modes, len(place), survey.lmax
     modes = [mode for mode in stored if mode.L > 0 and mode.d >= 0]
     cl = np.empty((size, size, lmax + 1))
     signal = np.zeros((size, size, len(modes), lmax + 1), dtype=np.complex128)
-    for x, y in found:
-        share = _overlap(survey, (x, y), 0).shared
-        cl[x, y] = cl[y, x] = np.sqrt(share) * _total_cl(survey, found, (x, y))
-        beam = np.nan_to_num(found[x, y].beam - found[x, y].circular)
+    kept = [pair for pair in found if place.keys() >= set(pair)]
+    for pair in kept:
+        x, y = (place[index] for index in pair)
+        share = _overlap(survey, pair, 0).shared
+        cl[x, y] = cl[y, x] = np.sqrt(share) * _total_cl(survey, found, pair)
+        beam = np.nan_to_num(found[pair].beam - found[pair].circular)
         for row, (L, M, d) in enumerate(modes):
             signal[x, y, row] = beam[stored.index(Mode(L, M, d))]
             if x != y:
                 # A^{LM}_{l1 l2} of the exchanged pair is (-1)^{l1+l2+L} A^{LM}_{l2 l1}.
                 l2 = np.flatnonzero(existing(L, d, lmax))
                 signal[y, x, row, l2] = (-1) ** (L + d) * beam[stored.index(Mode(L, M, -d)), l2 - d]
-    f_sky = min(sky_fraction(survey, pair) for pair in found)
+    f_sky = min(sky_fraction(survey, pair) for pair in kept)
     return float(np.sqrt(fisher_information(signal, modes, cl, f_sky)))
+
+
+def _seen_alike(survey: Survey, beams: Sequence[ScannedBeam], x: int, y: int) -> bool:
+    """Return True if two maps see the same in a sky, but for factors of l, wherever both see it."""
+    orders = range(max(len(beams[x].blm), len(beams[y].blm)))
+    absent = np.zeros_like(beams[x].blm[:1])
+    for s in orders[1:]:
+        one, other = (beams[i].blm[s : s + 1] if s < len(beams[i].blm) else absent for i in (x, y))
+        if not np.allclose(one * beams[y].blm[0], other * beams[x].blm[0], rtol=1e-10, atol=0.0):
+            return False
+        here, there = (_orientations(survey, beams, i, s, (x, y)) if one.any() else absent for i in (x, y))
+        if not np.array_equal(here, there):
+            return False
+    return True
+
+
+def _orientations(
+    survey: Survey, beams: Sequence[ScannedBeam], number: int, s: int, pair: tuple[int, int]
+) -> NDArray[np.complex128]:
+    """Return w_s of a map of a pair in the pixels that both weigh; where none has weights, its harmonics."""
+    weights = [survey.maps[index].weight for index in pair]
+    seen = [weight > 0.0 for weight in weights if weight is not None]
+    if not seen:
+        return beams[number].w[s]
+    return np.asarray(survey.maps[number].moments.w[s - 1, np.all(seen, axis=0)])

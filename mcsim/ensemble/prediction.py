@@ -134,7 +134,9 @@ def predict(
     if len(beams) > 1 and survey.config.biposh.pairs != "all":
         whole = replace(survey, estimator=estimator(survey.config.biposh.L_max, survey.lmax, both_orders=True))
         every = found_for(whole, [(x, y) for x in range(len(beams)) for y in range(x, len(beams))])
-    return result.assign(detectability.variables(survey, found, detectability.joint_signal_to_noise(whole, every)))
+    return result.assign(
+        detectability.variables(survey, found, detectability.joint_signal_to_noise(whole, beams, every))
+    )
 
 
 @dataclass(frozen=True)
