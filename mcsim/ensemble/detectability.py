@@ -20,6 +20,7 @@ from mcsim.bipolar.theory import (
 )
 from mcsim.ensemble import plan, summary
 from mcsim.ensemble.expectation import L_WEIGHTS, Means, nearer, spectrum
+from mcsim.simulation.filtering import LOWEST
 from mcsim.simulation.survey import Survey
 from mcsim.support.arrays import divided
 
@@ -109,19 +110,28 @@ def variables(survey: Survey, found: dict[tuple[int, int], Means], joint: float)
     each = np.full((len(survey.pairs), len(modes)), np.nan)
     binned = np.full((*each.shape, len(bins)), np.nan)
     for number, (x, y) in enumerate(survey.pairs):
-        signal = (found[x, y].beam - found[x, y].circular)[rows]
+        signal = _added(survey, found[x, y])[rows]
         spectra = _spectra(survey, found, (x, y), _overlap(survey, (x, y), 0).shared)
         f_sky = sky_fraction(survey, (x, y))
         each[number, rows] = signal_to_noise(signal, anisotropic, spectra, f_sky)
         for b, ells in enumerate(bins):
             binned[number, rows, b] = signal_to_noise(signal, anisotropic, spectra, f_sky, ells)
-    text = "signal to noise in one sky of what the beam adds to its circular part"
+    text = "signal to noise in one sky of what the beam adds to its circular part, l >= 2"
     jointly = "all maps and modes jointly (exact Fisher information)"
     return {
         "signal_to_noise": (("pair", "mode"), each, {"units": "1", "long_name": text}),
         "signal_to_noise_binned": (("pair", "mode", "bin"), binned, {"units": "1", "long_name": f"{text}, per bin"}),
         "signal_to_noise_total": ((), joint, {"units": "1", "long_name": f"{text}, {jointly}"}),
     }
+
+
+def _added(survey: Survey, found: Means) -> NDArray[np.complex128]:
+    """Return what the beam adds to the mean of its circular part, without l1 or l2 below those of the model's sky."""
+    added = found.beam - found.circular
+    ell = np.arange(survey.lmax + 1)
+    for row, mode in zip(added, survey.estimator.modes, strict=True):
+        row[(ell < LOWEST) | (ell - mode.d < LOWEST)] = 0.0
+    return added
 
 
 def joint_signal_to_noise(survey: Survey, beams: Sequence[ScannedBeam], found: dict[tuple[int, int], Means]) -> float:
@@ -156,7 +166,7 @@ def joint_signal_to_noise(survey: Survey, beams: Sequence[ScannedBeam], found: d
         x, y = (place[index] for index in pair)
         share = _overlap(survey, pair, 0).shared
         cl[x, y] = cl[y, x] = np.sqrt(share) * _total_cl(survey, found, pair)
-        beam = np.nan_to_num(found[pair].beam - found[pair].circular)
+        beam = np.nan_to_num(_added(survey, found[pair]))
         for row, (L, M, d) in enumerate(modes):
             signal[x, y, row] = beam[stored.index(Mode(L, M, d))]
             if x != y:

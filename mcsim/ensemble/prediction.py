@@ -58,7 +58,7 @@ def predict(
         To all orders in the beam, instead of leading order in its non-circular part.
     snr
         Add the signal to noise of the beam's BipoSH: ``signal_to_noise`` of each pair and mode, ``_binned`` the same
-        per bin, and ``_total`` of all maps jointly.
+        per bin, and ``_total`` of all maps jointly; of l1, l2 >= 2, for the model's sky has no monopole and dipole.
     L_moments
         Highest degree of the orientation moments if ``exact``, and of weights of pixels, such as masks; see
         :func:`mcsim.bipolar.theory.cmb_biposh_exact`. At least biposh.L_max, which is enough without these two, and

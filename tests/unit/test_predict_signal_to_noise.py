@@ -1,4 +1,4 @@
-"""Signal to noise of the beams' BipoSH: maps without noise."""
+"""Signal to noise of the beams' BipoSH: maps without noise, and the degrees that count."""
 
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,8 @@ def test_maps_without_noise_that_see_the_same_count_once() -> None:
     known = total(channel("A", ROUND), channel("C", WIDE, 1.0))
     assert total(channel("A", ROUND), channel("B", NARROW), channel("C", WIDE, 1.0)) == pytest.approx(known, rel=1e-12)
     assert one < known < np.inf
+    # With little noise two splits have the limit of none.
+    assert total(channel("A", WIDE, 0.01), splits=["a", "b"]) == pytest.approx(one, rel=1e-5)
 
 
 def test_nothing_hides_what_tells_maps_without_noise_apart() -> None:
@@ -66,3 +68,10 @@ def test_masks_count_where_maps_without_noise_are_compared(tmp_path: Path) -> No
     assert twice == pytest.approx(alone, rel=1e-12)
     assert alone < more < np.inf
     assert round_ == np.inf
+
+
+def test_degrees_that_the_sky_does_not_have_say_nothing() -> None:
+    """With 0.01 uK of noise the monopole that the beam makes of the quadrupole had nearly all of the signal."""
+    quiet, noisy = predicted(channel("A", WIDE)), predicted(channel("A", WIDE, 0.01))
+    for name in ("signal_to_noise", "signal_to_noise_binned", "signal_to_noise_total"):
+        np.testing.assert_allclose(noisy[name], quiet[name], rtol=1e-4)
