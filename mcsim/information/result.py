@@ -11,7 +11,7 @@ import xarray as xr
 
 from mcsim.datavector.candidate import Candidate, columns_of, numbered
 from mcsim.ensemble.store import write_dataset
-from mcsim.information.fisher import Information
+from mcsim.information.fisher import Information, variance_of_mean
 from mcsim.information.settings import LimitSettings
 from mcsim.stats.detection import snr_needed, snr_to_separate
 from mcsim.support.arrays import Matrix, Vector, divided, texts
@@ -228,12 +228,27 @@ def marginalised(fisher: Matrix, nuisances: Sequence[int], widths: Sequence[floa
     -----
     F_tt - F_tn (F_nn + diag(1/width^2))^-1 F_nt, the inverse of the covariance of the rows that are left.
     """
-    rest = [row for row in range(len(fisher)) if row not in set(nuisances)]
-    if not len(nuisances):
-        return fisher
+    return fisher[_others(fisher, nuisances)] @ _unexplained(fisher, nuisances, widths)
+
+
+def _others(fisher: Matrix, rows: Sequence[int]) -> list[int]:
+    return [row for row in range(len(fisher)) if row not in set(rows)]
+
+
+def _unexplained(fisher: Matrix, nuisances: Sequence[int], widths: Sequence[float]) -> Matrix:
+    """Return the combinations of rows that nuisances with priors of these widths leave of the others, shape (K, left).
+
+    Notes
+    -----
+    W, 1 in the row that is left and -(F_nn + diag(1/width^2))^-1 F_nt in nuisances. A small change of F by dF changes
+    the marginalised matrix by W^t dF W.
+    """
+    rest = _others(fisher, nuisances)
     own = fisher[np.ix_(nuisances, nuisances)] + np.diag(1.0 / np.asarray(widths, dtype=float) ** 2)
-    across = fisher[np.ix_(nuisances, rest)]
-    return np.asarray(fisher[np.ix_(rest, rest)] - across.T @ np.linalg.solve(own, across))
+    found = np.zeros((len(fisher), len(rest)))
+    found[rest] = np.eye(len(rest))
+    found[nuisances] = -np.linalg.solve(own, fisher[np.ix_(nuisances, rest)])
+    return found
 
 
 def canonical_correlations(fisher: Matrix, groups: Sequence[Sequence[int]]) -> Matrix:
@@ -273,11 +288,7 @@ def limits_of(
     left = numbered(rest)
     correlation = canonical_correlations(fisher, [candidate.columns for candidate in left])
     sizes = _sizes(left, fisher)
-    errors = np.zeros(len(left))
-    for group in information.left_out:
-        without = [_sizes(left, marginalised(matrix, rows, widths)) for matrix in group]
-        errors += (len(group) - 1.0) * np.var(without, axis=0)
-    errors = 0.5 * divided(np.sqrt(errors), sizes)
+    errors = 0.5 * divided(_errors_of_sizes(left, information, _unexplained(information.fisher, rows, widths)), sizes)
     found = []
     for index, candidate in enumerate(left):
         own = list(candidate.columns)
@@ -317,6 +328,17 @@ def _sizes(candidates: Sequence[Candidate], fisher: Matrix) -> Vector:
         typical, own = candidate.typical, fisher[np.ix_(candidate.columns, candidate.columns)]
         found.append(max(float(np.einsum("kj,kl,lj", typical, own, typical)) / typical.shape[1], 0.0))
     return np.array(found)
+
+
+def _errors_of_sizes(candidates: Sequence[Candidate], information: Information, left: Matrix) -> Vector:
+    """Return the errors of :func:`_sizes` from random probes; ``left`` are the rows that nuisances leave, (K, left)."""
+    found = np.zeros(len(candidates))
+    for place, candidate in enumerate(candidates):
+        typical = left[:, candidate.columns] @ candidate.typical
+        for group in information.pairs:
+            responses = np.tensordot(typical, group, (0, 0))
+            found[place] += variance_of_mean(0.5 * np.mean(responses**2, axis=0))
+    return np.sqrt(found) / max(len(information.pairs), 1)
 
 
 def _width(candidate: Candidate, settings: LimitSettings) -> float | None:
