@@ -48,7 +48,14 @@ def sky_fraction(survey: Survey, pair: tuple[int, int]) -> float:
     return float(np.mean(x * y) ** 2 / np.mean((x * y) ** 2))
 
 
-def _overlap(survey: Survey, pair: tuple[int, int], reach: int) -> Overlap:
+def overlap_of(survey: Survey, pair: tuple[int, int]) -> Overlap:
+    """Return how the weights of a pair of maps correlate the degrees of a bin and those beside it, for each M."""
+    return _overlap(
+        survey, pair, min(plan.layout(survey).bin_width - 1 + BESIDE, survey.lmax), survey.config.biposh.L_max
+    )
+
+
+def _overlap(survey: Survey, pair: tuple[int, int], reach: int = 0, d_max: int | None = None) -> Overlap:
     """Return how the weights of a pair of maps correlate degrees, up to ``reach`` apart.
 
     Filtered maps count as of independent degrees of the observed sky.
@@ -60,7 +67,7 @@ def _overlap(survey: Survey, pair: tuple[int, int], reach: int) -> Overlap:
         return FULL_SKY
     npix = next(weight.size for weight in weights if weight is not None)
     x, y = (np.ones(npix) if weight is None else weight for weight in weights)
-    return overlap(x, y, reach, L_WEIGHTS[-1])
+    return overlap(x, y, reach, L_WEIGHTS[-1], d_max)
 
 
 def scattered(survey: Survey, found: dict[tuple[int, int], Means], number: int) -> NDArray[np.float64]:
@@ -79,13 +86,14 @@ def scattered(survey: Survey, found: dict[tuple[int, int], Means], number: int) 
 
 
 def variances_of(
-    survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[int, int]
+    survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[int, int], weights: Overlap
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return variances for an isotropic sky, shape (mode, lmax + 1), and the covariance of bins, (mode, bin, bin)."""
+    """Return variances for an isotropic sky, shape (mode, lmax + 1), and the covariance of bins, (mode, bin, bin).
+
+    ``weights`` are those of :func:`overlap_of`.
+    """
     layout = plan.layout(survey)
     spectra = _spectra(survey, found, pair)
-    reach = min(layout.bin_width - 1 + BESIDE, survey.lmax)
-    weights = _overlap(survey, pair, reach)
     absent = np.isnan(found[pair].beam)
     shifted = [
         np.where(absent, np.nan, isotropic_variance(survey.estimator.modes, spectra, weights, shift))
@@ -111,7 +119,7 @@ def variables(survey: Survey, found: dict[tuple[int, int], Means], joint: float)
     binned = np.full((*each.shape, len(bins)), np.nan)
     for number, (x, y) in enumerate(survey.pairs):
         signal = _added(survey, found[x, y])[rows]
-        spectra = _spectra(survey, found, (x, y), _overlap(survey, (x, y), 0).shared)
+        spectra = _spectra(survey, found, (x, y), _overlap(survey, (x, y)).shared)
         f_sky = sky_fraction(survey, (x, y))
         each[number, rows] = signal_to_noise(signal, anisotropic, spectra, f_sky)
         for b, ells in enumerate(bins):
@@ -164,7 +172,7 @@ def joint_signal_to_noise(survey: Survey, beams: Sequence[ScannedBeam], found: d
     kept = [pair for pair in found if place.keys() >= set(pair)]
     for pair in kept:
         x, y = (place[index] for index in pair)
-        share = _overlap(survey, pair, 0).shared
+        share = _overlap(survey, pair).shared
         cl[x, y] = cl[y, x] = np.sqrt(share) * _total_cl(survey, found, pair)
         beam = np.nan_to_num(_added(survey, found[pair]))
         for row, (L, M, d) in enumerate(modes):

@@ -163,6 +163,7 @@ def test_two_masks_leave_errors_and_a_finite_signal_to_noise(tmp_path: Path) -> 
     expected = prediction.predict(shared, snr=True, L_moments=24)
     total = float(expected["signal_to_noise_total"])
     assert np.sqrt(float((expected["signal_to_noise"][[0, 2]] ** 2).sum())) < total < 10.0
+    assert "each M" in expected.attrs["errors"]
     cl = expected["cl_circular_mean"].values
     assert (cl[1] ** 2 > cl[0] * cl[2])[2:].any()
     skies = np.array([simulate.realize(shared, r)["biposh_circular"][1] for r in range(150)])

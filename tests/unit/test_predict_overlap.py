@@ -48,17 +48,18 @@ class Masked:
         return Spectra(found[0][: LMAX + 1], found[1][: LMAX + 1], found[2][: LMAX + 1] / self.norm)
 
     def covariance(self, L: int, d: int, l2: int, shift: int) -> float:
-        """E A_{l1 l2} A*_{l1+n l2+n} less the means, over all M, times the alternating sign."""
-        total = 0.0
+        """The mean over all M of that of single ones."""
+        return sum(self.of_one_M((L, M, d), l2, shift) for M in range(-L, L + 1)) / (2 * L + 1)
+
+    def of_one_M(self, mode: tuple[int, int, int], l2: int, shift: int) -> float:
+        """E A_{l1 l2} A*_{l1+n l2+n} less the means, times the alternating sign."""
         signs = np.array([(-1.0) ** m for _, m in INDEX])
         mirrored = [PLACE[ell, -m] for ell, m in INDEX]
         both = self.xy[:, mirrored] * signs  # <x_i y_j> without a conjugate
-        for M in range(-L, L + 1):
-            (i, j, g), (k, n, h) = (self.terms(L, M, d, ell) for ell in (l2, l2 + shift))
-            first = self.xx[np.ix_(i, k)] * self.yy[np.ix_(n, j)].T
-            second = both[np.ix_(i, n)] * both[np.ix_(k, j)].conj().T
-            total += float((g @ (first + second) @ h).real)
-        return (-1.0) ** shift * total / (2 * L + 1) / self.norm**2
+        (i, j, g), (k, n, h) = (self.terms(*mode, ell) for ell in (l2, l2 + shift))
+        first = self.xx[np.ix_(i, k)] * self.yy[np.ix_(n, j)].T
+        second = both[np.ix_(i, n)] * both[np.ix_(k, j)].conj().T
+        return (-1.0) ** shift * float((g @ (first + second) @ h).real) / self.norm**2
 
     @staticmethod
     def terms(L: int, M: int, d: int, l2: int) -> tuple[list[int], list[int], np.ndarray]:
@@ -98,6 +99,28 @@ def test_variances_of_masked_pairs_are_sums_over_covariances(name: str) -> None:
     for L, row in ((1, 1), (3, 5)):
         for l2 in (4, 6):
             assert variance[row, l2] == pytest.approx(masked.covariance(L, 0, l2, 0), rel=0.15)
+
+
+@pytest.mark.parametrize("names", [("tilted cap", "tilted cap"), ("belt", "belt"), ("tilted cap", "belt")])
+def test_variances_of_single_M_are_sums_over_covariances(names: tuple[str, str]) -> None:
+    """They were means over M: errors of single modes were 0.45 to 1.54 of them, and more for asymmetric masks."""
+    weights = {"tilted cap": cap(0.2 * X + 0.3 * Y + 0.9 * Z), "belt": belt(0.5 * X + 0.8 * Z)}
+    x, y = (weights[name] for name in names)
+    masked, l2, far = Masked(x, y), 9, 0.0
+    spectra = masked.spectra()
+    assert spectra.y is not None
+    modes = [mode for mode in all_modes(3, both_orders=True) if mode.L > 0 and (mode.in_auto or x is not y)]
+    modes = [mode for mode in modes if mode.L < 3 or abs(mode.d) == mode.M]
+    apart, mean = overlap(x, y, 2, 16, 3), overlap(x, y, 2, 16)
+    for shift in range(3):
+        found, before = (isotropic_variance(modes, spectra, one, shift)[:, l2] for one in (apart, mean))
+        l1 = np.array([l2 - mode.d for mode in modes])
+        scale = mean.autos[0].sum() * spectra.x[l1] * spectra.y[l2]
+        exact = np.array([masked.of_one_M(mode, l2, shift) for mode in modes])
+        assert np.abs(found - exact).max() < 0.1 * scale.min()
+        assert np.sqrt(np.mean(((found - exact) / scale) ** 2)) < 0.04
+        far = max(far, float(np.abs((before - exact) / scale).max()))
+    assert far > 0.25
 
 
 def test_equal_weights_share_all_and_those_of_all_sky_are_one() -> None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import eval_legendre
 
 from mcsim.bipolar.modes import Indices, check_modes, existing
+from mcsim.bipolar.theory.circles import Circles, circles
 from mcsim.bipolar.theory.harmonics import map_harmonics, spin_functions
 from mcsim.errors import InputError
 from mcsim.sphere.checks import check_cl, check_finite, check_shape
@@ -29,21 +30,28 @@ class Spectra(NamedTuple):
 class Overlap(NamedTuple):
     """How the weights of two maps correlate coefficients A_{l1 l2} and A_{l1+n, l2+n}, by degrees of the weights.
 
-    Factors of C^XX C^YY and of (C^XY)^2 for L = 0 or high l are sums over degrees; shape (n, degree of weights).
+    Factors of C^XX C^YY and of (C^XY)^2 for L = 0 or high l are sums over degrees; shape (n, degree of weights). They
+    are means over M; ``around`` says what single M differ by. None: nothing.
     """
 
     autos: NDArray[np.float64]
     cross: NDArray[np.float64]
+    around: Circles | None = None
 
     @property
     def shared(self) -> float:
         """Return the share of (C^XY)^2 that counts at a single l: one if both maps have the same weights."""
         return float(self.cross[0].sum() / self.autos[0].sum())
 
-    def factors(self, L: int, shift: int, lmax: int) -> NDArray[np.float64]:
+    def factors(self, mode: Indices, shift: int, lmax: int) -> NDArray[np.float64]:
         """Return both factors of A^{LM} at (l1 + l2 + n) / 2 = 0, 1/2, 1, ..., lmax, shape (2, 2 lmax + 1)."""
-        coupled = _coupling(L, self.autos.shape[1], lmax)
-        return np.stack([coupled @ self.autos[shift], coupled @ self.cross[shift]])
+        coupled = _coupling(mode[0], self.autos.shape[1], lmax)
+        found = np.stack([coupled @ self.autos[shift], (mode[2] == 0) * (coupled @ self.cross[shift])])
+        if self.around is None:
+            return found
+        # At low l the degrees of weights count less, in what M adds as in the mean.
+        less = [coupled @ one[0] / one[0].sum() for one in (self.autos, self.cross)]
+        return found + np.array(self.around.beside(mode, shift))[:, None] * less
 
 
 @lru_cache(maxsize=16)
@@ -57,8 +65,12 @@ def _coupling(L: int, size: int, lmax: int) -> NDArray[np.float64]:
 FULL_SKY = Overlap(np.ones((1, 1)), np.ones((1, 1)))
 
 
-def overlap(x: NDArray[np.float64], y: NDArray[np.float64], reach: int, L_max: int) -> Overlap:
+def overlap(
+    x: NDArray[np.float64], y: NDArray[np.float64], reach: int, L_max: int, d_max: int | None = None
+) -> Overlap:
     """Return the overlap of two weights of pixels, shape (npix,), up to n = ``reach``, from their degrees to ``L_max``.
+
+    With ``d_max`` it tells modes of |d| up to that of each M apart, of which else it is the mean.
 
     Notes
     -----
@@ -68,13 +80,20 @@ def overlap(x: NDArray[np.float64], y: NDArray[np.float64], reach: int, L_max: i
     is W_x^2 and W_y^2, or twice W_x W_y, over <W_x W_y>. A^{LM} couples degree K of f by the 6j symbol
     (-1)^(L+K) (2l+1) {l l L; l l K}, about P_L(1 - K(K+1)/(2l(l+1))), which is exact for L = 0 and 1, where K <= 2l.
     Sums over explicit covariances agree to a few per cent from l = 2 on: tests/unit/test_predict_overlap.py.
+    A^{LM}_{l1 l2} is the mean of D^L_{Md} over circles, whose pole is at theta, of what l1 and l2 have in common there:
+    its first term has the factor (2L+1) <d^L_{Md}(theta)^2 f_n f_n*>, its second one, also where d is not 0,
+    (2L+1) <d^L_{Md}(theta) d^L_{M,-d}(theta) f_{d+n} f_{d-n}>, f_n the n-th Fourier coefficient. Means over M are those
+    above, and the second term of d other than 0 has none.
     """
-    own, other, both = (map_harmonics(product, L_max) for product in (x * x, y * y, x * y))
+    products = [map_harmonics(product, L_max) for product in ((x * x, x * y) if x is y else (x * x, y * y, x * y))]
+    own, other, both = products[0], products[-2], products[-1]
     degrees = 2.0 * np.arange(L_max + 1) + 1.0
     share = 4.0 * np.pi / degrees * spin_functions(reach, L_max, np.array([0.5 * np.pi]))[..., 0] ** 2
     share /= 4.0 * np.pi * np.mean(x * y) ** 2
     autos = np.sum(own * other.conj(), axis=1).real
-    return Overlap(share * autos, share * np.sum(np.abs(both) ** 2, axis=1))
+    unit = float(np.mean(x * y)) ** 2
+    around = None if d_max is None else circles((own, other, both), unit, reach, d_max)
+    return Overlap(share * autos, share * np.sum(np.abs(both) ** 2, axis=1), around)
 
 
 def isotropic_variance(
@@ -88,8 +107,8 @@ def isotropic_variance(
     Notes
     -----
     C^XX_l1 C^YY_l2 + (-1)^L delta_{l1 l2} (C^XY_l)^2, each times its factor of the ``overlap``; for one map
-    C_l1 C_l2 (1 + delta_{l1 l2}), L even where l1 = l2. Variances are zero where they are less than 1e-12 of their
-    first term.
+    C_l1 C_l2 (1 + delta_{l1 l2}), L even where l1 = l2. Weights give single M such a second term with C^XY_l1 C^XY_l2
+    where l1 is not l2, too. Variances are zero where they are less than 1e-12 of their first term.
     """
     check_modes(modes)
     x = spectra.x
@@ -101,20 +120,19 @@ def isotropic_variance(
         check_cl(cl, lmax, name, cross=name == "cross")
         check_shape(cl, (lmax + 1,), name)
     variance = np.full((len(modes), lmax + 1), np.nan)
-    factors: dict[int, NDArray[np.float64]] = {}
-    for row, (L, _, d) in zip(variance, modes, strict=True):
+    for row, mode in zip(variance, modes, strict=True):
+        L, _, d = mode
         there = existing(L, d, lmax)
         l2 = np.flatnonzero(there[: lmax + 1 - shift] & there[shift:])
         square = x[l2 - d] * y[l2]
         if shift:
             square = np.sqrt(square * x[l2 - d + shift] * y[l2 + shift])
-        if L not in factors:
-            factors[L] = overlap.factors(L, shift, lmax)
-        first, second = factors[L][:, 2 * l2 - d + shift]
+        first, second = overlap.factors(mode, shift, lmax)[:, 2 * l2 - d + shift]
         product = first * square
-        row[l2] = product
-        if d == 0:
-            row[l2] += (-1) ** L * second * cross[l2] * cross[l2 + shift]
+        shared = cross[l2] * cross[l2 + shift]
+        if d:
+            shared = np.sqrt(np.abs(shared * cross[l2 - d] * cross[l2 - d + shift]))
+        row[l2] = product + (-1) ** L * second * shared
         if shift == 0:
             # For maps without noise and odd L only round-off of either sign remains.
             row[l2[row[l2] < 1e-12 * product]] = 0.0
