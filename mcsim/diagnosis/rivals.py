@@ -17,7 +17,7 @@ from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.selection import Attribution
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
-from mcsim.systematics import if_possible
+from mcsim.systematics import acts_through, if_possible
 
 CLEAR = 1e-6  #: global p-value up to which effects on request are tried where no other explains a gap: it is no chance
 MUCH = 0.4  #: share of the excess chi^2 that one of them explains alone then, before it is simulated at its amplitude
@@ -26,14 +26,17 @@ MUCH = 0.4  #: share of the excess chi^2 that one of them explains alone then, b
 def with_rivals(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[DataSet[Any], Refined] | None:
     """Return data and attribution with the effects on request that explain the data like sets that are to be named.
 
-    Where nothing else explains a clear gap, they are those that explain much of it alone. None if there are none.
+    Where nothing else explains a clear gap, they are those of one split that explain much of it alone. None if there
+    are none.
 
     Notes
     -----
     As a candidate each of them would raise the bar for all. Here it becomes a candidate for these data alone, and only
     if it can take the place of members of a set, in the data vector and in the numbers beside it: of several members,
     or, of the only set, of a single one. Global p-values stay those of the candidates that are always proposed. It is
-    simulated at the amplitude that it has there, as a member was. Patterns that are drawn are no rivals.
+    simulated at the amplitude that it has there, as a member was. Patterns that are drawn are no rivals. Alone only
+    what acts in one split is tried, which the other splits can contradict: a band on the sky of one channel, which no
+    library has, would be called a nonlinearity.
     """
     context, settings = data.context, data.context.settings
     sets = [one.members for one in found.explanations[: settings.compared_sets]]
@@ -42,7 +45,10 @@ def with_rivals(data: DataSet[Any], refined: Refined, found: Attribution) -> tup
         return None
     channels = {context.candidates[member].channel for members in sets for member in members}
     others = [one for one in on_request(context.analysis) if not one.random_response]
-    near = [one for one in others if not sets or one.channel in channels or None in (one.channel, *channels)]
+    near = [one for one in others if one.channel in channels or None in (one.channel, *channels)]
+    near = near if sets else [one for one in others if acts_through(one.effect, "steady_gain")]
+    if not near:
+        return None
     known = list(data.responses(near, settings.channel_skies))
     bent = dict(_alone(data, known)) if not sets else {}
     places: list[tuple[int, tuple[int, ...]]] = [(rival, ()) for rival in bent]

@@ -143,7 +143,7 @@ class Effect:
         How a diagnosis fits it; left out: the amplitude alone, of either sign.
     proposed
         False: a diagnosis proposes it only where it is asked for by name (``mcsim diagnose --with NAME``), or where it
-        explains the data in the place of effects that are about to be named, or alone where nothing else does.
+        explains the data in the place of effects that are about to be named (of one split: or of none).
     rank
         Order of effects on a beam's shape: -2 completes the fiducial one, -1 stretches, 1 adds what no other changes.
 
