@@ -49,8 +49,8 @@ def maps(survey: Survey, realization: int, nthreads: int = 1, epsilon: float = E
         observe = tod.sky_signal(seen, site.lmax, beam, epsilon, nthreads)
         for index, m in enumerate(channel.maps):
             grid = MapGrid(site.nside, site.frame, run.map.span(index))
-            of_split = replace(site, split=run.map.each_split[index])
-            stages = [_gained(acting, of_split), *after, _added(acting, of_split)]
+            steady = systematics.shared_gain(acting, replace(site, split=run.map.each_split[index]))
+            stages = [_gained(acting, site, steady), *after, _added(acting, site)]
             if (rings := run.map.rings(index)) is not None:
                 stages.append(tod.every_ring(site.pointed("of rings").model.spin_period_s, *rings))
             draw = rng.generator(run.ensemble.seed, realization, f"noise/{m.name}")
@@ -131,9 +131,8 @@ def _spread(channel: Channel, chunk: tod.Samples, reference: tod.Samples) -> tod
     return tod.shrunk(chunk, channel.site.nside, systematics.spread_of(channel.effects), reference)
 
 
-def _gained(acting: tuple[systematics.Effect, ...], site: systematics.Site) -> tod.Stage:
-    """Return a stage that multiplies the signal by one plus the errors of the gain."""
-    steady = systematics.shared_gain(acting, site)
+def _gained(acting: tuple[systematics.Effect, ...], site: systematics.Site, steady: float) -> tod.Stage:
+    """Return a stage that multiplies the signal by one plus the errors of the gain, one of which is ``steady``."""
 
     def gained(chunk: tod.Samples) -> Map:
         gain = np.full(chunk.time_s.size, 1.0 + steady)

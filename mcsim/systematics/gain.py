@@ -38,11 +38,7 @@ class Calibration(Effect):
     bounds = (Bound("amplitude", -0.5, 0.5, "a prior of this library: half of the dipole is seen by eye"),)
 
     def beam(self, beam: Beam, site: Site) -> Beam:
-        if self.amplitude <= -1.0:
-            raise InputError(
-                f"effect {self.name}: amplitude = {self.amplitude:g} leaves no signal; choose one above -1."
-            )
-        return replace(beam, blm=(1.0 + self.amplitude) * beam.blm)
+        return replace(beam, blm=(1.0 + _leaving_signal(self)) * beam.blm)
 
     def inverse(self) -> Self:
         return replace(self, amplitude=reciprocal(self.amplitude))
@@ -86,7 +82,16 @@ class SplitCalibration(Effect):
         if self.split not in site.splits:
             known = f"choose from {', '.join(site.splits)}" if site.splits else "name the splits in map.splits"
             raise InputError(f"effect {self.name}: split = {self.split!r} is no split of {site.channel}; {known}.")
-        return self.amplitude if site.split == self.split else 0.0
+        return _leaving_signal(self) if site.split == self.split else 0.0
+
+
+def _leaving_signal(effect: Effect) -> float:
+    """Return the amplitude of a calibration; InputError for one that leaves no signal."""
+    if effect.amplitude <= -1.0:
+        raise InputError(
+            f"effect {effect.name}: amplitude = {effect.amplitude:g} leaves no signal; choose one above -1."
+        )
+    return effect.amplitude
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import Survey, survey
 from mcsim.support.arrays import Map
 from mcsim.systematics import Effect, Site, catalogue
+from refusals import refused
 
 NSIDE = 16
 ELLIPSE = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 660.0, "fwhm_minor_arcmin": 540.0, "angle_deg": 20.0}
@@ -131,6 +132,13 @@ def test_a_calibration_of_one_split_is_that_of_all_in_its_map(changes):
         assert np.abs(first - route(bare, 0)[0]).max() < 1e-12
         assert np.abs(second - route(of_all, 0)[1]).max() < tolerance
         assert np.std(second - route(bare, 0)[1]) > 50.0
+
+
+def test_a_calibration_of_one_split_leaves_some_signal_and_names_a_split():
+    with refused("split_calibration", "-1.5", "-1"):
+        prepared(OF_SPLIT | {"amplitude": -1.5}, splits=["a", "b"])
+    with refused("split_calibration", "c", "a, b"):
+        prepared(OF_SPLIT | {"split": "c"}, splits=["a", "b"])
 
 
 def test_gains_of_one_split_and_of_the_year_add():
