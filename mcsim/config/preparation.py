@@ -36,7 +36,8 @@ class Smooth:
     """From the map's own beam to a target beam, in harmonics.
 
     ``fwhm_arcmin`` or ``window``: the target, a Gaussian or a file of B_l. ``own_fwhm_arcmin`` (0: none) or
-    ``own_window``: the map's own; default: the circular part of the channel's beam. ``channels``: default: all.
+    ``own_window``: the map's own; default: the target of the step "smooth" before, or else the circular part of the
+    channel's beam. ``channels``: default: all.
     """
 
     kind: Literal["smooth"] = "smooth"
@@ -130,7 +131,8 @@ class Rotate:
     frame: Frame
 
 
-Step = Annotated[Degrade | Smooth | SubtractDipole | Templates | Fill | Mask | Rotate, Field(discriminator="kind")]
+OtherStep = Degrade | SubtractDipole | Templates | Fill | Mask | Rotate  #: those that leave the beam as it is
+Step = Annotated[OtherStep | Smooth, Field(discriminator="kind")]
 STEPS = (Degrade, Smooth, SubtractDipole, Templates, Fill, Mask, Rotate)
 
 

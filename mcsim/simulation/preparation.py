@@ -220,16 +220,22 @@ def preparation(
     if not run.preparation:
         return None
     nside, frame = run.map.resolution, str(run.map.frame)
-    steps = []
+    steps: list[Step] = []
+    smoothed: NDArray[np.float64] | None = None
     for step in run.preparation:
         of_data = isinstance(step, declared.Templates) and bool(step.coefficients) and not step.simulated
-        if spec.name in (getattr(step, "channels", ()) or (spec.name,)) and (observed or not of_data):
+        if spec.name not in (getattr(step, "channels", ()) or (spec.name,)) or (of_data and not observed):
+            pass
+        elif isinstance(step, declared.Smooth):
+            change, smoothed = _change_of_beam(step, spec, 3 * nside - 1, smoothed)
+            steps.append(Filter("smooth", nside, nside, change, np.ones(change.size)))
+        else:
             steps.append(_step(step, spec, split, nside, frame))
         nside, frame = declared.grid_after([step], nside, frame)
     return Preparation(tuple(steps), nside, frame)
 
 
-def _step(step: declared.Step, spec: config.Channel, split: str | None, nside: int, frame: str) -> Step:
+def _step(step: declared.OtherStep, spec: config.Channel, split: str | None, nside: int, frame: str) -> Step:
     def mask(path: str | None, mask_frame: str | None) -> Map:
         if path is None:
             return np.ones(12 * nside**2)
@@ -242,9 +248,6 @@ def _step(step: declared.Step, spec: config.Channel, split: str | None, nside: i
             lmax = 3 * step.nside - 1
             pixels = healpix.pixel_window(step.nside, lmax) / healpix.pixel_window(nside, lmax)
             return Filter("degrade", nside, step.nside, np.ones(lmax + 1), pixels)
-        case declared.Smooth():
-            beam = _change_of_beam(step, spec, 3 * nside - 1)
-            return Filter("smooth", nside, nside, beam, np.ones(beam.size))
         case declared.SubtractDipole():
             return Regression(_harmonics(nside, step.monopole, step.dipole), mask(step.mask, step.mask_frame))
         case declared.Templates():
@@ -261,8 +264,13 @@ def _step(step: declared.Step, spec: config.Channel, split: str | None, nside: i
             return Rotated(frame, step.frame, nside)
 
 
-def _change_of_beam(step: declared.Smooth, spec: config.Channel, lmax: int) -> NDArray[np.float64]:
-    """Return target B_l over own B_l up to where the target, or what is left of the beam, is negligible."""
+def _change_of_beam(
+    step: declared.Smooth, spec: config.Channel, lmax: int, smoothed: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return target B_l over own B_l, and the target, up to where the target or what is left of the beam is negligible.
+
+    ``smoothed``: the target of a step before, which is then the map's own beam; None: there was none.
+    """
     if step.fwhm_arcmin is not None:
         target = healpy.gauss_beam(np.deg2rad(step.fwhm_arcmin / 60.0), lmax)
     else:
@@ -273,16 +281,18 @@ def _change_of_beam(step: declared.Smooth, spec: config.Channel, lmax: int) -> N
     elif step.own_window is not None:
         found = read_window(config.channel_path(step.own_window, spec.name))
         own = _up_to(lmax, found, f"own_window of {spec.name}")
+    elif smoothed is not None:
+        own = np.pad(smoothed, (0, max(lmax + 1 - smoothed.size, 0)))[: lmax + 1]
     else:
         own = _up_to(lmax, _own_window(spec, lmax), f"the beam of {spec.name}")
     end = int(np.argmin(np.append(np.minimum(np.abs(target), np.abs(own)) > NEGLIGIBLE, False)))
     change: NDArray[np.float64] = target[:end] / own[:end]
     if end == 0 or np.abs(change).max() > LARGEST_GAIN:
         raise InputError(
-            f"a target beam of a preparation is narrower than the beam of the maps of {spec.name} and would amplify "
-            f"them more than {LARGEST_GAIN:g} times; choose a wider target."
+            f"a target beam of a preparation is narrower than the beam of the maps of {spec.name} there, and would "
+            f"amplify them more than {LARGEST_GAIN:g} times; choose a wider target."
         )
-    return change
+    return change, target[:end]
 
 
 def _own_window(spec: config.Channel, lmax: int) -> NDArray[np.float64]:

@@ -178,6 +178,10 @@ class Filled(Step):
             raise InputError("a preparation has no observed pixel to fill the others from; widen its mask.")
         return np.asarray(hole)
 
+    def noise(self, power: Map) -> Map:
+        """Return the power, 0 in filled pixels, which have a value and no noise of their own."""
+        return np.where(self.masked | ~np.isfinite(power), 0.0, power)
+
     def local(self, values: NDArray) -> NDArray:
         """Return the values; filled pixels have no data."""
         return np.where(self.masked, np.nan, values)

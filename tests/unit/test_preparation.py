@@ -119,46 +119,6 @@ def test_window_of_the_mean_is_the_variance_of_the_means():
         assert windows.of_average(FINE, COARSE, ell)[ell] == pytest.approx(expected, rel=2e-3)
 
 
-def test_smoothing_is_that_of_healpy_and_undoes_the_own_beam(rng):
-    lmax = 60
-    sky = gaussian_alm(1.0 / (1.0 + np.arange(lmax + 1)) ** 2, rng)
-    own, target = np.deg2rad(4.0), np.deg2rad(8.0)
-    seen = healpix.synthesis(healpy.smoothalm(sky, own, inplace=False)[None], FINE, lmax)[0]
-    wanted = healpix.synthesis(healpy.smoothalm(sky, target, inplace=False)[None], FINE, lmax)[0]
-    step = {"kind": "smooth", "fwhm_arcmin": 480.0, "own_fwhm_arcmin": 240.0}
-    files = {"window": healpy.gauss_beam(target, 95), "own_window": healpy.gauss_beam(own, 95)}
-    for given in step, {"kind": "smooth", **files}:
-        # The quadrature of a low nside misses 1e-3 at the poles.
-        difference = prepare(run_with(given), seen) - wanted
-        assert difference.std() < 2e-4 * wanted.std()
-        assert np.abs(difference).max() < 2e-3 * wanted.std()
-
-
-def test_smoothing_starts_from_the_channels_beam():
-    run = run_with({"kind": "smooth", "fwhm_arcmin": 600.0})
-    channel = survey(run).channels[0]
-    assert channel.site.beam.window[:30] == pytest.approx(healpy.gauss_beam(np.deg2rad(10.0), 29), abs=1e-6)
-    assert channel.beam.mmax == survey(run_with()).channels[0].beam.mmax
-
-
-@pytest.mark.parametrize(
-    ("step", "beam"),
-    [
-        ({"window": healpy.gauss_beam(0.2, 70)}, {}),
-        ({"fwhm_arcmin": 480.0, "own_window": healpy.gauss_beam(0.05, 70)}, {}),
-        ({"fwhm_arcmin": 480.0}, {"kind": "window", "path": healpy.gauss_beam(0.05, 70)}),
-        ({"fwhm_arcmin": 480.0}, {"kind": "blm", "path": mcsim.Beam.gaussian(170.0, lmax=70).blm}),
-    ],
-)
-def test_tables_that_end_below_the_pixels_are_refused_with_what_helps(step, beam):
-    steps = [{"kind": "smooth"} | step]
-    run = run_with(*steps)
-    changes = {"channel": [config.to_dict(run)["channel"][0] | ({"beam": beam} if beam else {})]}
-    with refused("V", 70, 95, FINE, "3 nside", "degrade", 16):
-        survey(run_with(*steps, **changes))
-    survey(run_with({"kind": "degrade", "nside": 16}, *steps, **changes))
-
-
 @pytest.mark.parametrize("weights", [BAND, SOFT])
 def test_dipole_is_that_of_healpy(weights, rng):
     map_uk = rng.standard_normal(NPIX) + 30.0 + 5.0 * X - 8.0 * Z
@@ -234,6 +194,7 @@ CASES = {
     "averaged before smoothing": [{"kind": "degrade", "nside": 16}, {"kind": "smooth", "fwhm_arcmin": 300.0}],
     "harmonics": [{"kind": "degrade", "nside": COARSE, "method": "harmonics"}],
     "rotated": [{"kind": "rotate", "frame": "galactic"}],
+    "filled": [{"kind": "fill", "method": "constant", "mask": BAND}, {"kind": "degrade", "nside": COARSE}],
 }
 
 
