@@ -14,6 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 from mcsim.config import arrays, paths
 from mcsim.config.consistency import warn_of_units
 from mcsim.config.messages import read_from, sentence, shown
+from mcsim.config.noise import check_own_files
 from mcsim.config.preparation import grid_after
 from mcsim.config.schema import RunConfig, analysis_lmax, pixel_window
 from mcsim.errors import InputError
@@ -84,6 +85,7 @@ def load(source: str | Path | Mapping[str, Any] | RunConfig, base: str | Path | 
     paths.find_descriptions(plain)
     config = _validate(plain, where)
     paths.check_files(config, plain, where)
+    check_own_files(config, where)
     warn_of_units(config)
     return config if file is None else read_from(config, file)
 

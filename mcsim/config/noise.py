@@ -6,6 +6,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from pydantic.dataclasses import dataclass
 
 from mcsim.config.values import STRICT, PathText
+from mcsim.errors import InputError
 
 Level = Annotated[float, Field(ge=0.0)]
 
@@ -150,6 +151,34 @@ def check_differences(noise: Any, split_noise: dict[str, Any]) -> None:
         f"{key} is given, but the maps of a differencing scan are made from differences; give their noise as "
         "noise.sigma0_uk alone"
     )
+
+
+def check_own_files(run: Any, where: str) -> None:
+    """Raise InputError for maps of a run that share their noise, and splits whose hits or variances are one file.
+
+    Each map has noise of its own, and ``noise`` describes every split by itself: hits of a whole survey are not those
+    of its parts. A ``split_noise`` for each split may name one file.
+    """
+    of_realizations: dict[str, str] = {}
+    for one in run.each_map:
+        noise, key = one.channel.noise_of(one.split), f"channel[{one.channel.name}].noise"
+        if isinstance(noise, NoiseRealizations):
+            files = noise.files.replace("{channel}", one.channel.name).replace("{split}", str(one.split))
+            if files in of_realizations:
+                raise InputError(
+                    f"{where}: {key}.files = {noise.files!r} gives the maps {of_realizations[files]} and {one.name} "
+                    "one and the same noise; name files of their own, with {channel} or {split} in the name."
+                )
+            of_realizations[files] = one.name
+        shared = [name for name in run.map.splits if name not in one.channel.split_noise]
+        field = "variance" if isinstance(noise, NoiseVariance) else "hits"
+        file = getattr(noise, field, None)
+        if one.split in shared[1:] and isinstance(noise, Noise | NoiseVariance) and file and "{split}" not in file:
+            raise InputError(
+                f"{where}: {key}.{field} = {file!r} is one file for the splits {', '.join(shared)}, but each has "
+                f"{field if field == 'hits' else 'variances'} of its own; put {{split}} in the name, or give each its "
+                "file in split_noise."
+            )
 
 
 def check_splits(channel: Any, splits: tuple[str, ...], split_by: str) -> None:

@@ -23,7 +23,8 @@ _RJ = r"rj|a|ant(?:enna)?|rayleigh[\s_-]*jeans|b|brightness"
 _KELVIN = re.compile(
     rf"(milli|micro|nano|mu|m|u|n|)[\s_-]*(?:kelvin|k)[\W_]*(?:({_CMB})|({_RJ}))?(?:[\W_]*temp\w*)?\W*"
 )
-_SQUARE = re.compile(r"\(?([^()]*?)\)?\s*(?:\^|\*\*)?\s*\(?2\)?")
+# Of a base that ends without a sign, for K^-2 is no square.
+_SQUARE = re.compile(r"(?!1\s*/)\(?([^()]*?[^()\s^*+/−-])\)?\s*(?:\^|\*\*)?\s*\(?2\)?")
 _SILENT = {"", "unknown", "none", "n/a", "undefined"}
 
 _FRAMES = {

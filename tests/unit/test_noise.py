@@ -1,5 +1,6 @@
 """Noise that a run gives for pixels: files in the layouts of WMAP and Planck, levels, refusals, identity."""
 
+import json
 from pathlib import Path
 
 import healpy
@@ -213,6 +214,41 @@ def test_splits_have_their_own_files(tmp_path):
     split = {"nside": NSIDE, "frame": "galactic", "splits": ["year1", "year2"]}
     run = run_with({"kind": "variance", "variance": str(tmp_path / "{split}.fits")}, map=split)
     assert [m.noise_uk.max() for m in survey(run).channels[0].maps] == [1.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("noise", "key"),
+    [
+        ({"sigma0_uk": 50.0, "hits": HITS}, "hits"),
+        ({"kind": "variance", "variance": VARIANCE}, "variance"),
+    ],
+)
+def test_splits_do_not_share_hits_or_variances(noise, key):
+    """Hits of a whole survey as those of its halves made their noise too small by the root of two."""
+    split = {"nside": NSIDE, "frame": "galactic", "splits": ["year1", "year2"]}
+    with refused(f"channel[W].noise.{key}", "year1, year2", "{split}", "split_noise"):
+        run_with(noise, map=split)
+    channel = config.to_dict(run_with(noise))["channel"][0]
+    own = {"noise": {"sigma0_uk": 1.0}, "split_noise": dict.fromkeys(("year1", "year2"), channel["noise"])}
+    made = survey(run_with({}, map=split, channel=[channel | own])).channels[0].maps
+    np.testing.assert_array_equal(made[0].noise_uk, made[1].noise_uk)
+
+
+def test_stores_of_runs_that_are_refused_now_are_still_read():
+    split = {"nside": NSIDE, "frame": "galactic", "splits": ["year1", "year2"]}
+    stored = config.to_dict(run_with({"sigma0_uk": 50.0, "hits": HITS})) | {"map": split}
+    assert config.from_json(json.dumps(stored)).map.splits == ("year1", "year2")
+
+
+@pytest.mark.parametrize("unit", ["uK^-2", "K_CMB**-2", "uK^(-2)", "uK-2", "1/uK^2", "uK^−2"])
+def test_inverse_variances_are_no_variances(unit):
+    with refused("ivar.fits", unit, "variances"):
+        header.to_uk2(unit, Path("ivar.fits"))
+
+
+@pytest.mark.parametrize("unit", ["mK^2", "mK**2", "mK2", "(mK)^2", "mK_CMB^2", "(mK)**(2)", "mK ^ 2"])
+def test_squares_are_variances(unit):
+    assert header.to_uk2(unit, Path("var.fits")) == 1e6
 
 
 def test_arrays_stand_for_files_and_make_the_same_run(wmap):

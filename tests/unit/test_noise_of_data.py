@@ -182,6 +182,21 @@ def test_the_hash_is_over_the_first_file_and_the_name(files, tmp_path):
     assert digest("n_{realization:03d}.fits") != before
 
 
+def test_no_two_maps_have_the_same_noise(files, tmp_path):
+    """Without {split} in the name all splits had one and the same noise, and two channels with one template too."""
+    noise = {"kind": "realizations", "files": files}
+    with refused("channel[W].noise.files", "W:a and W:b", "{split}"):
+        run_with(noise, ("a", "b"))
+    two = [config.to_dict(run_with(noise))["channel"][0] | {"name": name} for name in ("V", "W")]
+    with refused("channel[W].noise.files", "V and W", "{channel}"):
+        run_with(noise, channel=two)
+    for number in range(4):
+        for split in "ab":
+            copy = tmp_path / f"{split}_{number:03d}.fits"
+            copy.write_bytes((tmp_path / f"n_{number:03d}.fits").read_bytes())
+    assert run_with({"kind": "realizations", "files": str(tmp_path / "{split}_{realization:03d}.fits")}, ("a", "b"))
+
+
 def test_effects_scale_drawn_noise(files):
     effect = [{"name": "noise_level", "channel": "W", "amplitude": 0.5}]
     plain, louder = (
