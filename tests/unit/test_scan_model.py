@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from mcsim.instrument.scan.model import LineOfSight, ScanModel
+from mcsim.instrument.scan.model import LineOfSight, ScanModel, read_described
 from refusals import refused
 
 MODELS = Path(__file__).parents[2] / "scan_models"
@@ -112,6 +112,34 @@ def test_missing_file_and_missing_lines(tmp_path, write):
         ScanModel.load(tmp_path / "none.toml")
     with refused("[[line_of_sight]]", "boresight_angle_deg"):
         ScanModel.load(write(GOOD.split("[[line_of_sight]]")[0]))
+
+
+DESCRIBED = """
+spin_period_s = 100.0
+precession_period_s = -5000.0
+precession_angle_deg = 30.0
+orbit_period_s = 31557600.0
+spin_phase_deg = 40.0
+orbit_phase_deg = 100.0
+boresight_angle_deg = 60.0
+sample_period_s = 0.5
+samples = 1000
+beam_x_axis = "spin axis x boresight"
+spin_azimuth_rad = { W1 = 0.5 }
+"""
+
+
+def test_a_short_description_has_its_phases(write):
+    """They were dropped: effects that know of the spin acted 40 degrees off."""
+    model, dipole_uk = read_described(write(DESCRIBED))
+    assert (model.spin_phase_deg, model.precession_phase_deg, model.orbit_phase_deg) == (40.0, 0.0, 100.0)
+    assert dipole_uk is None
+
+
+@pytest.mark.parametrize("key", ["dipole_mk", "spin_phase_rad", "boresight_angle"])
+def test_a_short_description_has_no_numbers_that_nobody_reads(write, key):
+    with refused(key, "dipole_uk", "spin_phase_deg"):
+        read_described(write(f"{key} = 3.3\n{DESCRIBED}"))
 
 
 def test_unknown_names(write):

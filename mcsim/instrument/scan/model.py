@@ -192,10 +192,10 @@ class ScanModel:
 def read_described(path: Path) -> tuple[ScanModel, float | None]:
     """Return how a survey was pointed, and the amplitude of the dipole that it saw, uK; None if nothing is said of it.
 
-    The file is a scan model, or a survey's short description: TOML with the periods and angles of a scan model, one
-    ``boresight_angle_deg``, the number of ``samples``, the azimuth of every channel about the spin axis in a table
-    ``spin_azimuth_rad``, and optionally ``dipole_uk``. Its lines of sight bear the names of the channels. InputError if
-    the file cannot be read, lacks a number, or is of neither kind.
+    The file is a scan model, or a survey's short description: TOML with the periods, angles and phases of a scan model,
+    one ``boresight_angle_deg``, the number of ``samples``, the azimuth of every channel about the spin axis in a table
+    ``spin_azimuth_rad``, and optionally ``dipole_uk``; further keys may hold text. Its lines of sight bear the names of
+    the channels. InputError if the file cannot be read, lacks a number, has an unknown one, or is of neither kind.
     """
     table, where = _read_toml(path), str(path)
     if "spin_azimuth_rad" not in table:
@@ -209,7 +209,10 @@ def read_described(path: Path) -> tuple[ScanModel, float | None]:
         azimuth = _number(azimuths, name, where)
         check_angle(azimuth, f"{where}: spin_azimuth_rad of {name}")
         lines.append({"name": name, "boresight_angle_deg": boresight, "azimuth_deg": math.degrees(azimuth)})
-    copied = {key: _number(table, key, where) for key in NUMBERS - _OPTIONAL - {"duration_days"}}
+    numbers = NUMBERS - {"duration_days"}
+    stated = {key: value for key, value in table.items() if not isinstance(value, str)}  # text is for people
+    _refuse_unknown(stated, numbers | {"boresight_angle_deg", "dipole_uk", "samples", "spin_azimuth_rad"}, where)
+    copied = {key: _number(table, key, where) for key in numbers if key in table or key not in _OPTIONAL}
     days = _number(table, "samples", where) * copied["sample_period_s"] / SECONDS_PER_DAY
     model = {"schema": 1, "name": path.stem, **copied, "duration_days": days, "line_of_sight": lines}
     dipole = _number(table, "dipole_uk", where) if "dipole_uk" in table else None
