@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import reduce
+from typing import NamedTuple
 
 import healpy
 import numpy as np
@@ -198,10 +199,10 @@ def _map_parts(
         for s, map_uk in convolve.spin_maps(dipole, _fiducial_response(channel), nside, nthreads).items():
             spins[s] = spins[s] - map_uk if s in spins else -map_uk
     flat = made.map(circular) if smooth else None
-    whole = None
     gains = [_gain_of(m, systematics.spread_of(channel.effects)) for m in channel.maps]
+    scaled = None
     if any(gain is not None for gain in gains):
-        whole = convolve.CircularMaps(nside, survey.config.sky.lmax, nthreads)
+        scaled = _seen_by_gains(channel, seen, nthreads)
     gradient = None
     terms = _expansion(channel)
     offsets: list[Map] = []
@@ -220,8 +221,8 @@ def _map_parts(
         for effect, own in systematics.disturbing(channel.effects):
             draw = rng.generator(seed, realization, f"{own}/noise/{m.name}")
             extra.append(divided(effect.excess(m.moments.hits, draw), m.moments.hits))
-        if gain is not None and whole is not None:
-            extra.append(_gained(gain, m, whole, convolve.circular_alm(seen, channel.response)))
+        if gain is not None and scaled is not None:
+            extra.append(_gained(gain, m, scaled, index))
         if m.signal_uk is not None:
             extra.append(m.signal_uk)
         difference = convolve.noncircular_map(spins, m.moments) if spins else None
@@ -250,16 +251,36 @@ def _gain_of(m: SurveyMap, spread: float) -> NDArray[np.complex128] | None:
     return found
 
 
-def _gained(gain: NDArray[np.complex128], m: SurveyMap, made: convolve.CircularMaps, circular: Alm) -> Map:
+class _Scaled(NamedTuple):
+    """What an error of the gain scales: all that the circular part of the beam sees."""
+
+    alm: Alm
+    made: convolve.CircularMaps  # its maps at the pixels' centres, which splits share
+    offsets: list[Map]  # what the samples' offsets add to each map; empty where their mean is all that counts
+
+
+def _seen_by_gains(channel: Channel, seen: Alm, nthreads: int) -> _Scaled:
+    """Return what errors of the gain scale in a channel, the dipole in it."""
+    terms, made = _expansion(channel), convolve.CircularMaps(channel.site.nside, channel.site.lmax, nthreads)
+    if terms is None:
+        return _Scaled(convolve.circular_alm(seen, channel.response), made, [])
+    unwindowed = _unwindowed(channel, seen, None)
+    offsets = offset_maps(unwindowed, terms, [m.moments for m in channel.maps], nthreads)
+    return _Scaled(alm_.multiply(unwindowed, terms.smooth, channel.site.lmax), made, offsets)
+
+
+def _gained(gain: NDArray[np.complex128], m: SurveyMap, scaled: _Scaled, index: int) -> Map:
     """Return what the error of the gain makes of a sky through the circular part of the beam, samples off the centres.
 
-    ``circular``: its a_lm; ``made``: its maps, which splits share.
+    The mean error of a pixel scales all that the offsets of its samples do; what varies inside it the first order.
     """
-    added = gain[0].real * made.map(circular)
-    if m.moments.dtheta is None:
-        return added
-    off_centre = replace(m.moments, dtheta=gain[1].real, dphi=gain[1].imag)
-    return added + convolve.centroid_map(made.gradient(circular), off_centre)
+    mean, at_centre = gain[0].real, scaled.made.map(scaled.alm)
+    added = mean * (at_centre + scaled.offsets[index] if scaled.offsets else at_centre)
+    if m.moments.dtheta is None or m.moments.dphi is None or (scaled.offsets and m.gain is None):
+        return np.asarray(added)
+    varying = gain[1] - mean * (m.moments.dtheta + 1j * m.moments.dphi) if scaled.offsets else gain[1]
+    off_centre = replace(m.moments, dtheta=varying.real, dphi=varying.imag)
+    return np.asarray(added + convolve.centroid_map(scaled.made.gradient(scaled.alm), off_centre))
 
 
 def _expansion(channel: Channel) -> Expansion | None:
