@@ -164,18 +164,22 @@ def check_effects(run: config.RunConfig) -> None:
     """Refuse a run with an effect that is not known, or cannot act where it is put, as the run would; make no map."""
     for spec in run.channels:
         acting = effects_on(run, spec.name)
-        if not acting:
-            continue
-        with in_channel(run, spec):
-            if run.map.grid == "gl":
-                refuse_pixel_effects(spec.name, acting)
-            if isinstance(spec.scan, config.ScanDifferencing):
-                refuse_excess(spec.name, acting)
-            else:
-                refuse_differences(spec.name, acting)
-            _refuse_noise(run, spec, acting)
-            site = site_of(run, spec)
-            _warn_of_orders(run, spec, systematics.tried(acting, site), site.beam)
+        if acting:
+            with in_channel(run, spec):
+                refuse_misplaced(run, spec, acting)
+                site = site_of(run, spec)
+                _warn_of_orders(run, spec, systematics.tried(acting, site), site.beam)
+
+
+def refuse_misplaced(run: config.RunConfig, spec: config.Channel, acting: tuple[systematics.Effect, ...]) -> None:
+    """Refuse effects on what a channel does not have: pixels, differences or single beams, noise or its memory."""
+    if run.map.grid == "gl":
+        refuse_pixel_effects(spec.name, acting)
+    if isinstance(spec.scan, config.ScanDifferencing):
+        refuse_excess(spec.name, acting)
+    else:
+        refuse_differences(spec.name, acting)
+    _refuse_noise(run, spec, acting)
 
 
 def _refuse_noise(run: config.RunConfig, spec: config.Channel, acting: tuple[systematics.Effect, ...]) -> None:

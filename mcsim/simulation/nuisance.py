@@ -13,7 +13,7 @@ from mcsim import config, systematics
 from mcsim.config.messages import standing
 from mcsim.errors import InputError
 from mcsim.simulation import convolve
-from mcsim.simulation.channels import check_scope, site_of, table_of
+from mcsim.simulation.channels import check_scope, refuse_misplaced, site_of, table_of
 from mcsim.simulation.pixel_means import (
     Part,
     drifts,
@@ -166,7 +166,8 @@ def _nuisance(run: config.RunConfig, entry: config.Nuisance, library: Library | 
 def check_nuisances(run: config.RunConfig, library: Library | None = None) -> int:
     """Return the highest order of the beams that nuisances can make.
 
-    Raise InputError for one that is not known, or that four prior widths make impossible.
+    Raise InputError for one that is not known or acts on what its channel does not have, or that four prior widths make
+    impossible.
     """
     orders = 0
     for number, one in enumerate(nuisances_of(run, library)):
@@ -177,10 +178,13 @@ def check_nuisances(run: config.RunConfig, library: Library | None = None) -> in
 
 def _orders_at_most(run: config.RunConfig, one: Nuisance) -> int:
     orders = 0
+    channels = [spec for spec in run.channels if one.channel in (None, spec.name)]
+    for spec in channels:
+        refuse_misplaced(run, spec, (one.at(np.array(one.widths)),))
     try:
-        for effect, spec in product(one.extremes(), run.channels):
-            if one.channel in (None, spec.name):
-                orders = max(orders, tried((effect,), site_of(run, spec)).mmax)
+        for effect, spec in product(one.extremes(), channels):
+            refuse_misplaced(run, spec, (effect,))
+            orders = max(orders, tried((effect,), site_of(run, spec)).mmax)
     except InputError as error:
         text = str(error).rstrip(".")
         raise InputError(

@@ -199,6 +199,9 @@ def test_a_limit_takes_the_scatter_of_a_prior_of_one_sign():
             {"effect": "foreground_residual", "width": 1.0, "parameters": {"template": "absent.fits"}},
             ("nuisance[0].parameters.template",),
         ),
+        # What acts on nothing that the channel has did nothing, in silence.
+        ({"effect": "transmission_imbalance", "channel": "V1", "width": 0.01}, ("V1", "differencing")),
+        ({"effect": "noise_knee", "channel": "V1", "width": 0.1}, ("noise_knee", "correlated")),
     ],
 )
 def test_what_cannot_be_a_nuisance_is_refused(nuisance, named):
