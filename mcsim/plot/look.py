@@ -35,10 +35,10 @@ def look_at_beams(
     """Yield the text and figure of the beams of a run configuration, of a beam map, or of a file of b_lm or B_l.
 
     ``source`` is a TOML configuration or packaged workflow (every channel is shown), or a file: a FITS image is a beam
-    map, a FITS table holds b_lm or, in a single column, B_l, a text (.txt, .dat) B_l. ``lmax`` is by default 2048, or
-    what the file holds or its pixels resolve, and of b_lm or B_l in a run its ``sky.lmax``; ``m_max`` is chosen from
-    the beam, and ``pixel_deg``, the side of a pixel of a beam map in degrees, read from its header. InputError for what
-    the source does not have, or says itself.
+    map, a FITS table holds b_lm or, in a single column, B_l, a text (.txt, .dat) B_l, .npz a saved beam. ``lmax`` is by
+    default 2048, or what the file holds or its pixels resolve, and of b_lm or B_l in a run its ``sky.lmax``; ``m_max``
+    is chosen from the beam, and ``pixel_deg``, the side of a pixel of a beam map in degrees, read from its header.
+    InputError for what the source does not have, or says itself.
     """
     path = user_path(source)
     if path.is_dir() or (not path.exists() and path.suffix not in ("", ".toml")):
@@ -53,10 +53,10 @@ def look_at_beams(
             tabled = isinstance(spec, config.BeamBlm | config.BeamWindow)
             degree = lmax or (run.sky.lmax if tabled else _reach(image))
             yield _look_at(channel.name, channels.load_beam(channel, degree), image)
-    elif path.suffix not in (".txt", ".dat") and beams.holds_image(path):
+    elif path.suffix not in (".txt", ".dat", ".npz") and beams.holds_image(path):
         image = beams.read_map(path, pixel_deg=pixel_deg)
         yield _look_at(path.name, beams.Beam.from_map(image, lmax or _reach(image), m_max), image)
-    elif path.suffix in (".txt", ".dat") or beams.holds_window(path):
+    elif path.suffix != ".npz" and (path.suffix in (".txt", ".dat") or beams.holds_window(path)):
         _refuse(f"{source} holds B_l of a circular beam, which has no", "", m_max=m_max or None, pixel_deg=pixel_deg)
         window = beams.read_window(path, lmax)
         yield _look_at(path.name, beams.Beam.from_window(window, min(lmax or LMAX, window.size - 1)), None)

@@ -26,6 +26,7 @@ from mcsim.ensemble import plan
 from mcsim.ensemble.runner import cluster
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel
+from mcsim.plot.look import look_at_beams
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
@@ -320,6 +321,11 @@ def test_beam_of_an_array_is_that_of_its_file(tmp_path) -> None:
         np.testing.assert_array_equal(found.blm, read.blm)
     found.save(tmp_path / "beam.npz")
     assert Beam.from_blm(tmp_path / "beam.npz").blm.tobytes() == found.blm.tobytes()
+    [look] = look_at_beams(tmp_path / "beam.npz")
+    assert "beam.npz" in look.text
+    dataclasses.replace(found, blm=2.0 * found.blm).save(tmp_path / "double.npz")
+    with refused("double.npz", "b_00"):
+        Beam.from_blm(tmp_path / "double.npz")
 
 
 def test_the_page_on_a_diagnosis_names_the_keys_of_its_verdict() -> None:

@@ -301,6 +301,10 @@ class Beam:
             raise InputError(f"{path} holds no beam ({error}): write it with Beam.save") from None
         if beam.mmax < (mmax or 0):
             raise InputError(f"{path} stops at mmax = {beam.mmax}, below the mmax = {mmax} asked for: lower mmax")
+        try:
+            beam.check_normalised()
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
         beam = replace(beam, blm=cut(beam.blm, lmax, str(path)).copy())
         return beam if mmax is None else beam.truncated(mmax)
 
