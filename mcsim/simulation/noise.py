@@ -201,6 +201,12 @@ def _difference(
     sigma = float(np.sqrt(np.sum(h * apart**2) / freedom))
     if sigma == 0.0:
         raise InputError(f"the splits {', '.join(map(str, paths))} do not differ; give maps of independent noise.")
+    if sigma**2 < SMALLEST_UK2 * float(np.median(h)):
+        raise InputError(
+            f"the splits {', '.join(map(str, paths))} differ by {sigma / math.sqrt(float(np.median(h))):.3g} uK in a "
+            f"pixel, less than the noise of any map ({math.sqrt(SMALLEST_UK2):g} uK); say their unit in their headers "
+            "(TUNIT), or give them in uK."
+        )
     return Level(sigma, sigma / float(np.sqrt(2.0 * freedom)), int(used.sum()), len(maps), noise.isotropic), hits
 
 
@@ -250,9 +256,11 @@ def _positive(path: Path, moments: Moments, names: Sequence[str], alone: bool = 
 
     ``alone``: a file with a single column holds it, whatever it is called.
     """
-    values, _, unit = healpix.read_map(path, tuple(names), moments.frame, alone=alone)
+    other = (*healpix.POLARISATION, *(healpix.VARIANCE if names is healpix.HITS else healpix.HITS))
+    values, _, unit = healpix.read_map(path, tuple(names), moments.frame, alone=alone, other=other)
     _check_nside(values, path, moments)
     if names is healpix.HITS:
+        header.refuse_temperature(unit, path, "the number of observations")
         check_not_infinite(values, str(path))  # an infinite variance is that of a pixel that was not observed
     values = np.where(np.isfinite(values) & (values > UNSEEN_BELOW), values, 0.0)
     if unit is None and names is healpix.VARIANCE and 0.0 < values.max() < SMALLEST_UK2:

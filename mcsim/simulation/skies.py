@@ -1,5 +1,6 @@
 """Skies that users give, as files of a_lm or of maps, refused in one sentence where they cannot be used."""
 
+import warnings
 from pathlib import Path
 
 import healpy
@@ -17,8 +18,8 @@ from mcsim.support.npy import read_npy
 
 LARGEST_UK = 1e7  #: of a user's sky: 10 K, more than the Galaxy has in any band of a CMB survey
 
-SMALLEST_UK = 0.01
-"""Of the largest value of a user's sky that is not zero: a CMB sky in K has 5e-4, and any in uK has more than 1."""
+SMALLEST_UK, SMALL_UK = 0.01, 1.0
+"""Of the largest value of a user's sky that is not zero: a CMB sky in K has 5e-4, in mK 0.5, and in uK more than 1."""
 
 
 def given(run: config.RunConfig, realization: int) -> Alm | None:
@@ -56,7 +57,7 @@ def read_alm(path: Path, lmax: int, frame: str, frequency_ghz: float | None = No
         raise InputError(f"{path} is in {stated} coordinates, the run's maps in {frame}; rotate the sky first.")
     factor = header.to_uk(str(keywords.get("TUNIT2", "")), path, frequency_ghz)
     alm = alm if factor == 1.0 else factor * alm
-    _check_size(path, alm)
+    _check_size(path, alm, keywords.get("TUNIT2"))
     return alm_.resize(alm, found, lmax)
 
 
@@ -66,7 +67,7 @@ def read_map(path: Path, lmax: int, frame: str, frequency_ghz: float | None = No
     ``frame`` is the run's, and the file's where it states one; ``frequency_ghz`` is what the run's channels have in
     common: antenna temperature and brightness need it. InputError if the file cannot be used so.
     """
-    map_uk = healpix.read_uk(path, frame, frequency_ghz)
+    map_uk, stated = healpix.read_uk_and_unit(path, frame, frequency_ghz)
     nside = healpy.npix2nside(map_uk.size)
     if nside & (nside - 1):
         raise InputError(f"{path} has nside {nside}, which is not a power of two; bring the sky to one that is.")
@@ -74,12 +75,12 @@ def read_map(path: Path, lmax: int, frame: str, frequency_ghz: float | None = No
         raise InputError(f"{path} has pixels that are not finite or unseen; a sky must be complete.")
     if lmax > 3 * nside - 1:
         raise InputError(f"{path} has nside {nside}, good to l = {3 * nside - 1}; the sky's lmax {lmax} is above it.")
-    _check_size(path, map_uk)
+    _check_size(path, map_uk, stated)
     return healpix.analysis(map_uk, lmax, iterations=3)
 
 
-def _check_size(path: Path, sky: NDArray[np.generic]) -> None:
-    """Refuse what a flipped bit or another unit makes of a sky."""
+def _check_size(path: Path, sky: NDArray[np.generic], unit: str | None) -> None:
+    """Refuse what a flipped bit or another unit makes of a sky, and warn of a file that may be in mK."""
     largest = float(np.max(np.abs(sky)))
     if largest > LARGEST_UK:
         raise InputError(f"{path} holds {largest:.3g} uK, more than any sky ({LARGEST_UK:g} uK); correct its unit.")
@@ -87,4 +88,10 @@ def _check_size(path: Path, sky: NDArray[np.generic]) -> None:
         raise InputError(
             f"{path} holds at most {largest:.3g} uK, less than any sky ({SMALLEST_UK:g} uK); is it in K? Say the unit "
             "in its header (TUNIT), or give it in uK."
+        )
+    if not unit and path.suffix != ".npy" and 0.0 < largest < SMALL_UK:
+        warnings.warn(
+            f"{path} holds at most {largest:.3g} uK, less than a sky of the CMB; if it is in mK, say so in its header "
+            "(TUNIT), or give it in uK.",
+            stacklevel=4,
         )

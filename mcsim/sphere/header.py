@@ -120,6 +120,14 @@ def to_uk(unit: str | None, path: Path, frequency_ghz: float | None = None) -> f
     return 1e6 * _brightness_to_k(unit, path, frequency_ghz, text)
 
 
+def refuse_temperature(unit: str | None, path: Path, wanted: str) -> None:
+    """Raise InputError if a unit is one of temperature, or of its square, where ``wanted`` has neither."""
+    text = (unit or "").strip().replace("µ", "u").replace("μ", "u").lower()
+    squared = _SQUARE.fullmatch(text)
+    if _KELVIN.fullmatch(text) or (squared and _KELVIN.fullmatch(squared[1])):
+        raise InputError(f"{path} is in {unit!r}, but {wanted} has no such unit; give another file, or correct TUNIT.")
+
+
 def to_uk2(unit: str | None, path: Path, frequency_ghz: float | None = None) -> float:
     """Return the factor from a unit of variance, such as K_CMB^2 or mK**2, to uK^2; 1 if the header gives none.
 

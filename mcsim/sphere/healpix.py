@@ -252,17 +252,26 @@ HITS = ("N_OBS", "HITS", "NOBS", "HIT", "NHITS")
 VARIANCE = ("II_COV", "VARIANCE", "I_VAR", "COV_II", "VAR_I", "VAR")
 """Names of columns with the variance of the temperature."""
 
+POLARISATION = tuple(f"{stokes}{end}" for stokes in "QU" for end in ("", "_STOKES", "_POLARISATION", "_POLARIZATION"))
+"""Names of columns with Stokes parameters other than the temperature, in the maps of Planck and of healpy."""
+
 
 def read_map(
-    path: Path, names: tuple[str, ...] = (), frame: str | None = None, bad: float = healpy.UNSEEN, alone: bool = True
+    path: Path,
+    names: tuple[str, ...] = (),
+    frame: str | None = None,
+    bad: float = healpy.UNSEEN,
+    alone: bool = True,
+    other: tuple[str, ...] = (),
 ) -> tuple[Map, str | None, str | None]:
     """Read a map of a HEALPix FITS file in RING order, and its frame and unit if the header has them.
 
     It is the column that is called one of ``names``; without names the temperature, or else the first column. A file
-    with a single column need not name it, unless it holds something else (``alone`` False). Pixels of the value that
-    the header calls BAD_DATA become ``bad``. A .npy file holds an array of shape (npix,) in RING order; its frame and
-    unit are None. Raise InputError if the file cannot be read as a HEALPix map, does not say whether it is RING or
-    NESTED, names an unknown frame, or another one than ``frame``, or has a BAD_DATA that is no number.
+    with a single column need not name it, unless it holds something else: its temperature, which was read already
+    (``alone`` False), or what its name, one of ``other``, says. Pixels of the value that the header calls BAD_DATA
+    become ``bad``. A .npy file holds an array of shape (npix,) in RING order; its frame and unit are None. Raise
+    InputError if the file cannot be read as a HEALPix map, does not say whether it is RING or NESTED, names an unknown
+    frame, or another one than ``frame``, or has a BAD_DATA that is no number.
     """
     if path.suffix == ".npy":
         array = read_npy(path, "biuf").astype(np.float64)
@@ -275,7 +284,7 @@ def read_map(
         raise InputError(f"{path} does not exist; give a HEALPix map in FITS.")
     with unreadable(path, "a HEALPix map", "give a complete FITS map"), warnings.catch_warnings():
         warnings.simplefilter("error", category=AstropyUserWarning)
-        field = _column_called(path, names, alone)
+        field = _column_called(path, names, alone, other)
         map_, header = healpy.read_map(path, dtype=float, h=True, field=field)
     keywords = dict(header)
     if str(keywords.get("ORDERING", "")).strip().upper() not in ("RING", "NESTED"):
@@ -309,17 +318,22 @@ def _replaced(map_: Map, stated: object, bad: float, path: Path) -> Map:
 
 
 def read_uk(path: Path, frame: str, frequency_ghz: float | None) -> Map:
-    """Read a map of temperatures, uK, in RING order; what was not observed stays as it is.
+    """Read a map of temperatures as :func:`read_uk_and_unit` does."""
+    return read_uk_and_unit(path, frame, frequency_ghz)[0]
+
+
+def read_uk_and_unit(path: Path, frame: str, frequency_ghz: float | None) -> tuple[Map, str | None]:
+    """Read a map of temperatures, uK, in RING order, and the unit that it states; what was not observed stays as it is.
 
     Raise InputError as :func:`read_map` does, if the header names a unit that cannot be converted, or if pixels are
     infinite.
     """
-    map_, _, unit = read_map(path, frame=frame)
+    map_, _, unit = read_map(path, frame=frame, other=(*HITS, *VARIANCE, *POLARISATION))
     check_not_infinite(map_, str(path))
-    return np.where(map_ > UNSEEN_BELOW, to_uk(unit, path, frequency_ghz) * map_, map_)
+    return np.where(map_ > UNSEEN_BELOW, to_uk(unit, path, frequency_ghz) * map_, map_), unit
 
 
-def _column_called(path: Path, names: tuple[str, ...], alone: bool) -> int:
+def _column_called(path: Path, names: tuple[str, ...], alone: bool, other: tuple[str, ...]) -> int:
     """Return the number of the map called one of ``names`` (none: of temperature), not counting pixel indices."""
     with opened(path) as hdus:
         table = first_table(hdus)
@@ -329,8 +343,9 @@ def _column_called(path: Path, names: tuple[str, ...], alone: bool) -> int:
     for name in names or TEMPERATURE:
         if name in columns:
             return columns.index(name)
-    if (len(columns) == 1 and alone) or not names:
+    if ((len(columns) == 1 and alone) or not names) and columns[0] not in other:
         return 0
+    names = names or TEMPERATURE
     raise InputError(f"{path} has the columns {', '.join(columns)} and none called {' or '.join(names)}; name it so.")
 
 

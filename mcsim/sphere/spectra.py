@@ -22,6 +22,9 @@ _NAMES_OF_D_L = re.compile(
 )
 _NAMES_OF_C_L = re.compile(r"(?i)(?<![a-z])C_?[\{(]?\\?(l|ell)(?=TT|[^a-z]|$)")
 
+_NAMES_OF_OTHERS = re.compile(r"(?i)(?<![a-z])(EE|BB|TE|ET|EB|TB|GRAD(IENT)?|CURL|[EGC]-[TEGC]|T-[EGC])(?![a-z])")
+_NAMES_OF_TEMPERATURE = re.compile(r"(?i)(?<![a-z])(TT|T-T|temperature|C_?l(?![a-z_]))(?![a-z])")
+
 DEGREES = ("l", "ell", "multipole")  #: names of columns of ell in FITS tables
 
 _TO_UK2 = {"uk2": 1.0, "muk2": 1.0, "microk2": 1.0, "mk2": 1e6, "k2": 1e12}
@@ -36,7 +39,10 @@ SMALLEST_UNSTATED_UK2 = 0.03
 """The same for a table that does not state its unit: the CMB has 6000 uK^2, which is 0.006 mK^2."""
 
 D_L_RANGE_UK2, D_L_SLOPE, D_L_ROWS = (50.0, 5e4), -0.8, 6
-"""A table of D_l of the CMB, l <= 300: its median, least d ln / d ln l (C_l has -1.6) and least number of rows."""
+"""A table of D_l of the CMB, l <= 300: its median, least d ln / d ln l (C_l has -1.6) and least number of rows.
+
+If it states no unit, the median may be in mK^2 as well.
+"""
 
 
 def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
@@ -77,6 +83,10 @@ def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
     """
     check_whole(lmax, "lmax")
     cl, names, stated = _read(spec)
+    if _NAMES_OF_OTHERS.search(names) and not _NAMES_OF_TEMPERATURE.search(names):
+        raise InputError(
+            f"power spectrum {str(spec)!r} says {names.strip()[:60]!r}, so it is not of the temperature; give TT."
+        )
     if not len(cl):
         raise InputError(f"power spectrum {str(spec)!r} is empty; give C_l from l = 0 to {lmax}.")
     if len(cl) <= lmax:
@@ -94,7 +104,7 @@ def load(spec: str | Path, lmax: int) -> NDArray[np.float64]:
             )
     where = f"power spectrum {str(spec)!r}"
     _check_size(where, table, stated)
-    _check_shape(where, table, _NAMES_OF_C_L.search(names) is not None)
+    _check_shape(where, table, _NAMES_OF_C_L.search(names) is not None, stated)
     return cl
 
 
@@ -135,7 +145,7 @@ def _check_size(where: str, cl: NDArray[np.float64], stated: bool) -> None:
         )
 
 
-def _check_shape(where: str, cl: NDArray[np.float64], named: bool) -> None:
+def _check_shape(where: str, cl: NDArray[np.float64], named: bool, stated: bool) -> None:
     """Raise InputError for a table of D_l, or of C_l that starts at ell = 2; warn if it may be right."""
     first = np.arange(min(len(cl), 8))
     if len(first) == 8 and cl[:8].min() > 0.0:
@@ -145,16 +155,19 @@ def _check_shape(where: str, cl: NDArray[np.float64], named: bool) -> None:
     ell = np.arange(2, min(len(cl), 301))
     ell = ell[cl[ell] > 0.0]
     low, high = D_L_RANGE_UK2
-    if len(ell) < D_L_ROWS or not low < np.median(cl[ell]) < high:
+    if len(ell) < D_L_ROWS:
+        return
+    median, white = float(np.median(cl[ell])), np.ptp(cl[ell]) < 1e-3 * cl[ell[0]]
+    in_mk2 = not stated and not white and low < _TO_UK2["mk2"] * median < high
+    if not (low < median < high or in_mk2):
         return
     slope = np.polyfit(np.log(ell), np.log(cl[ell]), 1)[0]
-    white = np.ptp(cl[ell]) < 1e-3 * cl[ell[0]]
     if slope < D_L_SLOPE or (white and named):
         return
     message = (
-        f"{where} has {np.median(cl[ell]):.3g} uK^2 as its median up to l = {ell[-1]} and does not fall as C_l of the "
-        "CMB does, so it seems to hold D_l = l(l+1) C_l / 2 pi; divide by l(l+1) / 2 pi, or name the column C_ell if "
-        "it is C_l."
+        f"{where} has {median:.3g} as its median up to l = {ell[-1]} and does not fall as C_l of the CMB does, so it "
+        f"seems to hold D_l = l(l+1) C_l / 2 pi in {'mK^2' if in_mk2 else 'uK^2'}; divide by l(l+1) / 2 pi, or name the "
+        "column C_ell if it is C_l."
     )
     if not (white or named):
         raise InputError(message)

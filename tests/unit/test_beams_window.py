@@ -8,6 +8,7 @@ from astropy.io import fits
 import mcsim
 from mcsim import config
 from mcsim.instrument import scan
+from mcsim.instrument.beams import read_window
 from mcsim.plot.look import look_at_beams
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -35,7 +36,7 @@ def written(path, *hdus):
 
 def wmap_text(folder):
     path, error = folder / "ampl_bl_W1.txt", np.full(LMAX + 1, 0.01)
-    header = "WMAP beam transfer function\n l  B_l  fractional error"
+    header = "WMAP beam transfer function as well as its error\n l  B_l  fractional error"
     np.savetxt(path, np.stack([np.arange(LMAX + 1), WINDOW, error], axis=1), fmt=["%d", "%.17g", "%g"], header=header)
     return path
 
@@ -103,6 +104,22 @@ def test_its_contents_are_in_the_hash(tmp_path):
     before = config.digest(run_with({"kind": "window", "path": str(path)}))
     np.save(path, WINDOW**2)
     assert config.digest(run_with({"kind": "window", "path": str(path)})) != before
+
+
+@pytest.mark.parametrize(
+    "header", ["l  W_l (beam squared)", "l W_{ell}", "l B_l^2", "window function squared", "l, w_l"]
+)
+def test_a_text_that_says_that_it_is_squared_is_refused(header, tmp_path):
+    """It looks like B_l of a wider beam, and was taken for it."""
+    path = tmp_path / "wl.txt"
+    np.savetxt(path, np.stack([np.arange(LMAX + 1), WINDOW**2], axis=1), fmt=["%d", "%.17g"], header=header)
+    with refused(path, "W_l", "B_l"):
+        read_window(path)
+
+
+def test_a_negative_degree_is_refused():
+    with refused("lmax", -1):
+        read_window(WINDOW, -1)
 
 
 def test_a_text_of_a_window_is_shown(tmp_path):

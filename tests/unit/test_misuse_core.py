@@ -299,6 +299,10 @@ def test_sky_maps(tmp_path):
     ):
         with refused(*named):
             skies.read_map(write_map(path, values, **keywords), LMAX, "ecliptic")
+    small = 0.5 / np.abs(MAP).max() * MAP
+    with pytest.warns(UserWarning, match=r"0\.5 uK.*mK.*TUNIT"):
+        skies.read_map(write_map(path, small, TUNIT1=None), LMAX, "ecliptic")
+    skies.read_map(write_map(path, small, TUNIT1="uK"), LMAX, "ecliptic")  # says that it is
 
 
 def test_sky_alm(tmp_path):

@@ -286,6 +286,30 @@ def test_files_that_do_not_fit_are_refused(columns, keywords, named, tmp_path):
         survey(run_with({"kind": "variance", "variance": path}))
 
 
+@pytest.mark.parametrize(
+    ("noise", "columns", "units", "named"),
+    [
+        ("variance", {"N_OBS": HITS}, {}, ("N_OBS", "II_COV")),
+        ("hits", {"II_COV": VARIANCE}, {}, ("II_COV", "N_OBS")),
+        ("hits", {"Q_STOKES": HITS}, {}, ("Q_STOKES", "N_OBS")),
+        ("hits", {"TEMPERATURE": HITS}, {"TEMPERATURE": "mK"}, ("mK", "observations")),
+        ("hits", {"TEMPERATURE": HITS}, {"TEMPERATURE": "K_CMB^2"}, ("K_CMB^2", "observations")),
+    ],
+)
+def test_a_lone_column_that_is_called_something_else_is_refused(noise, columns, units, named, tmp_path):
+    path = table(tmp_path / "bad.fits", columns, units)
+    given = {"sigma0_uk": 1.0, "hits": path} if noise == "hits" else {"kind": "variance", "variance": path}
+    with refused(path, *named):
+        survey(run_with(given))
+
+
+@pytest.mark.parametrize("name", ["HITS", "II_COV", "Q_POLARISATION"])
+def test_what_is_no_temperature_is_no_map(name, tmp_path):
+    path = Path(table(tmp_path / "bad.fits", {name: HITS}))
+    with refused(path, name, "TEMPERATURE"):
+        healpix.read_uk(path, "galactic", None)
+
+
 def test_another_nside_is_refused():
     run = run_with({"sigma0_uk": 1.0, "hits": np.ones(12 * 8**2)})
     with refused(8, NSIDE, "map.nside"):

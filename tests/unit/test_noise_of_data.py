@@ -135,6 +135,12 @@ def test_equal_maps_have_no_noise(observed):
         survey(run)
 
 
+def test_splits_in_another_unit_are_refused(observed):
+    """Of maps in K that say no unit, the noise was a millionth of what it is."""
+    with refused("TUNIT", 1e-4):
+        survey(run_with({"kind": "difference", "maps": list(1e-6 * observed), "hits": list(HITS)}))
+
+
 @pytest.fixture
 def files(tmp_path):
     """Four maps of noise in K, anisotropic and correlated."""

@@ -143,6 +143,8 @@ def test_truncated_fits(tmp_path, kept):
         ("Jy^2", "TT", ("'Jy^2'", "uK^2")),
         ("uK", "TT", ("'uK'", "uK^2")),
         ("uK^2", "D_ELL", ("D_l",)),
+        ("uK^2", "EE", ("EE", "TT")),
+        ("uK^2", "GRADIENT", ("GRADIENT", "TT")),
     ],
 )
 def test_wrong_fits_columns(tmp_path, unit, name, named):
@@ -166,6 +168,7 @@ def write_text(path, cl, header="", first=2):
         ("", 1.0),
         ("ell C_ell", 1.0),
         ("ell C_ell [uK^2]", 1.0),
+        ("ell TT, the first of TT TE EE BB", 1.0),
         ("l, C_l (uK_CMB^2)", 1.0),
         ("l, C_l (uK_{CMB}^2)", 1.0),
         ("l, C_l in uK thermodynamic**2", 1.0),
@@ -190,6 +193,9 @@ def test_units_of_text_tables(tmp_path, header, factor):
         (LCDM, "ell C_ell [K^2]", ("uK^2", "TUNIT1")),
         (D_L, "", ("D_l",)),
         (D_L[:31], "", ("D_l",)),
+        (1e-6 * D_L, "", ("D_l", "mK^2")),
+        (LCDM, "l EE [uK^2]", ("EE", "TT")),
+        (LCDM, "ell C_ell^TE", ("TE", "TT")),
         (1e-12 * D_L, "", ("uK^2", "TUNIT1")),
         (LCDM, "l DlTT", ("D_l",)),
         (LCDM, "l D_l_TT", ("D_l",)),

@@ -25,6 +25,10 @@ DEGREES = ("L", "ELL", "MULTIPOLE")
 SQUARED = re.compile(r"(?i)^w_?(l|ell)$|^b_?(l|ell)_?\^?(2|sq|squared)$|_2_")
 """Names of columns of W_l = B_l^2; those of Planck's HFI have _2_ in them."""
 
+_SAID_SQUARED = re.compile(
+    r"(?i)(?<![a-z])(w_?\{?l(?![a-z])|w_\{?ell(?![a-z])|b_?\{?(l|ell)\}?\s*(\^|\*\*)\s*\{?2)|squared"
+)
+
 LARGEST = 1.05  #: of |B_l| over B_0: more is no beam
 
 
@@ -54,6 +58,8 @@ def read_window(
             f"{origin} starts at B_0 = {found[0]:g} and reaches {np.abs(found).max():g}, where B_l is 1 at l = 0 and "
             "falls; give B_l, neither its square nor b_l0."
         )
+    if lmax is not None and lmax < 0:
+        raise InputError(f"lmax = {lmax} of {origin} is negative; give a degree.")
     if lmax is not None and found.size <= lmax:
         raise InputError(f"{origin} holds B_l up to l = {found.size - 1}, but l = {lmax} is needed; lower lmax.")
     return found if lmax is None else found[: lmax + 1]
@@ -67,6 +73,9 @@ def _of_text(path: Path) -> Window:
     with unreadable(path, "a table of B_l", "give columns ell and B_l"), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of an empty file, which is refused
         table = np.loadtxt(path, ndmin=2)
+        comments = [line.strip() for line in path.read_text("utf-8", "replace").splitlines() if line.startswith("#")]
+    if said := next((line for line in comments if _SAID_SQUARED.search(line)), None):
+        raise InputError(f"{path} says {said[:60]!r}, so it seems to hold W_l = B_l^2; give the file of B_l.")
     if table.shape[1] == 1:
         return np.asarray(table[:, 0])
     _check_counts(table[:, 0], f"{path} (first column)")
