@@ -166,8 +166,8 @@ def _check_shape(where: str, cl: NDArray[np.float64], named: bool, stated: bool)
         return
     message = (
         f"{where} has {median:.3g} as its median up to l = {ell[-1]} and does not fall as C_l of the CMB does, so it "
-        f"seems to hold D_l = l(l+1) C_l / 2 pi in {'mK^2' if in_mk2 else 'uK^2'}; divide by l(l+1) / 2 pi, or name the "
-        "column C_ell if it is C_l."
+        f"seems to hold D_l = l(l+1) C_l / 2 pi in {'mK^2' if in_mk2 else 'uK^2'}; divide by l(l+1) / 2 pi, or name "
+        "the column C_ell if it is C_l."
     )
     if not (white or named):
         raise InputError(message)
