@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.datavector.analysis import Analysis, Job, data_vectors
 from mcsim.datavector.bipolar_scan import rms
-from mcsim.datavector.candidate import Candidate, TemplateBank, numbered, signal_share
+from mcsim.datavector.candidate import TemplateBank, numbered, signal_share
 from mcsim.datavector.kept import Kept
 from mcsim.datavector.null_ensemble import NullEnsemble, without_nuisances
 from mcsim.datavector.repeats import check_alike, check_distinct, check_fresh
+from mcsim.datavector.responses import responses, scaled, size_error, skies, steps
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import pair_classes
 from mcsim.ensemble import runner
@@ -26,9 +27,8 @@ from mcsim.errors import InputError
 from mcsim.simulation.nuisance import draws
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.shrinkage import shrunk
-from mcsim.support.arrays import Alm, Cl, Vector
+from mcsim.support.arrays import Alm, Cl, Matrix, Vector
 from mcsim.support.progress import reporting
-from mcsim.systematics import Effect
 
 Rows = NDArray[np.float64]
 Task = Callable[[Job], Rows]
@@ -37,16 +37,10 @@ Ask = Callable[[Sequence[Job]], list[Rows]]  #: return the results of jobs, in o
 Batch = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[tuple[int, Any]]]
 """Call a function with tuples of arguments; yield (index, result) in the order of completion."""
 
-MODES = 1 << 16
-"""Modes of the sky that maps show, up to which responses are averaged over the least numbers of skies that settings
-have; of more modes over fewer, as each sky tells as much more."""
-
 LOOKED_AT = 500
 """Simulations from which on it is measured what their covariance is worth: of fewer the number scatters too much."""
 
 LEAST, STEP = 1.25, 0.25  #: simulations per element at the first look, and between two at most
-
-FEWEST = 2  #: skies over which any response is averaged: their scatter is its error
 
 PER_TASK = 10
 _CONSTRAINED_PER_TASK = 4
@@ -141,7 +135,7 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
     known = all(channel.site.pointing is not None for channel in analysis.model.survey.channels)
     if time_ordered and analysis.of_maps and known:
         quiet = replace(base.unfiltered(), channels=tuple(c.without_noise() for c in base.channels))
-        for job in in_tasks(analysis.job(quiet), range(_scaled(analysis, settings.time_ordered_skies)), 1):
+        for job in in_tasks(analysis.job(quiet), range(scaled(analysis, settings.time_ordered_skies)), 1):
             jobs[Purpose("time-ordered", job.first)] = replace(job, sample_by_sample=True)
             jobs[Purpose("default", job.first)] = job
     for job in null_jobs(analysis, wanted):
@@ -152,7 +146,7 @@ def plan(analysis: Analysis, simulations: int | None = None, time_ordered: bool 
         jobs[Purpose("reference", job.first)] = job
         if own is not None:
             jobs[Purpose("external reference", job.first)] = replace(job, source=own)
-    for candidate, column, sign, effect in _steps(analysis):
+    for candidate, column, sign, effect in steps(analysis):
         table = candidate.table(effect)
         acting = replace(analysis.job(with_effects(base, [table])), source=analysis.source_of([table]))
         if count := skies(analysis, candidate, sign):
@@ -203,38 +197,6 @@ def in_tasks(job: Job, realizations: range, size: int = PER_TASK) -> list[Job]:
     return [replace(job, first=first, count=min(size, stop - first)) for first in range(realizations.start, stop, size)]
 
 
-def _steps(analysis: Analysis) -> Iterator[tuple[Candidate, int, int, Effect]]:
-    """Yield candidate, column, sign and effect of every response that is simulated."""
-    for candidate in analysis.candidates:
-        for column, effect in zip(candidate.columns, candidate.basis, strict=True):
-            for sign in (1, -1):
-                if candidate.parametrization.sign in (0, sign):
-                    yield candidate, column, sign, effect.scaled(sign)
-
-
-def skies(analysis: Analysis, candidate: Candidate, sign: int = 1) -> int:
-    """Return the number of skies over which the response to a candidate is averaged, or those of one sign."""
-    settings = analysis.settings
-    if not analysis.of_maps:
-        return min(settings.table_skies, settings.noisy_skies)
-    if candidate.random_response:
-        return settings.noisy_skies
-    fewest = settings.channel_skies
-    if candidate.channel is None:
-        fewest = settings.typical_skies if candidate.parametrization.mean_response else settings.common_skies
-    fewest = max(FEWEST, _scaled(analysis, fewest))
-    count = min(max(fewest, -(-settings.response_modes // analysis.model.lmax**2)), settings.noisy_skies)
-    opposite = sign < 0 and candidate.parametrization.sign == 0
-    return math.ceil(settings.opposite_share * count) if opposite else count
-
-
-def _scaled(analysis: Analysis, skies: int) -> int:
-    """Return as many skies as tell of maps with more modes what so many tell of maps with MODES of them."""
-    model = analysis.model
-    shown = float((2.0 * np.arange(model.lmax + 1) + 1.0) @ model.sky_power)
-    return math.ceil(skies * min(1.0, MODES / shown))
-
-
 def learned(
     analysis: Analysis, ask: Ask, simulations: int | None = None, time_ordered: bool = True
 ) -> tuple[NullEnsemble, TemplateBank]:
@@ -256,19 +218,6 @@ def learned(
         check_distinct(null[:, :size], analysis.source, _COVARIANCE)
         check_alike(null[:, :size], analysis.source, _COVARIANCE)
     labels = tuple(label for candidate in analysis.candidates for label in candidate.labels)
-    matrix, curvature, error = np.zeros((3, whole, len(labels)))
-    measured: dict[int, Rows] = {}
-    for candidate, column, sign, effect in _steps(analysis):
-        other = results.get(Purpose("response", column, -sign))
-        if sign < 0 and other is not None:
-            continue  # done with the other sign
-        here = results[Purpose("response", column, sign)]
-        step = candidate.parametrization.coordinates(effect)[candidate.columns.index(column)]
-        same = references[jobs[Purpose("response", column, sign)].source is not None][: len(here)]
-        each, curvature[:, column] = responses(step, here, other, same)
-        measured[column] = each[:, :size]
-        matrix[:, column] = each.mean(axis=0)
-        error[:, column] = each.std(axis=0, ddof=1) / np.sqrt(len(each))
     offset = np.zeros(whole)
     if analysis.of_maps and len(default := stacked("default")):
         offset = np.mean(stacked("time-ordered") - default, axis=0)
@@ -296,12 +245,49 @@ def learned(
         slice_reference=reference[:, size:],
         slice_elements=analysis.slices,
     )
-    share = np.ones(len(labels))
-    bank = TemplateBank(matrix[:size], error[:size], curvature[:size], labels, share, matrix[size:])
+    measured = _measured(analysis, jobs, ask, results, references, ensemble.gaussian.whitening)
+    matrix, curvature, error = np.zeros((3, whole, len(labels)))
+    share, number = np.ones((2, len(labels)))
+    for column, (each, bend) in measured.items():
+        matrix[:, column], curvature[:, column], number[column] = each.mean(axis=0), bend, len(each)
+        error[:, column] = each.std(axis=0, ddof=1) / np.sqrt(len(each))
+    bank = TemplateBank(matrix[:size], error[:size], curvature[:size], labels, share, number, matrix[size:])
     faint = bank.faint(ensemble.spread, analysis.settings)
     for column in np.flatnonzero(faint.any(axis=0)).tolist():
-        share[column] = signal_share(measured[column], faint[:, column], ensemble.gaussian.whitening)
+        share[column] = signal_share(measured[column][0][:, :size], faint[:, column], ensemble.gaussian.whitening)
     return ensemble, bank
+
+
+def _measured(
+    analysis: Analysis,
+    jobs: Mapping[Purpose, Job],
+    ask: Ask,
+    results: Mapping[Purpose, Rows],
+    references: Mapping[bool, Rows],
+    whitening: Matrix,
+) -> dict[int, tuple[Rows, Vector]]:
+    """Return response in each sky, (skies, p + E), and curvature of every column, of as many skies as its size needs.
+
+    ``references``: the same skies without effects, of mcsim (False) and of an external simulator.
+    """
+    settings, here, found = analysis.settings, dict(results), dict[int, tuple[Rows, Vector]]()
+    while True:
+        more: dict[Purpose, Job] = {}
+        for candidate, column, sign, effect in steps(analysis):
+            purpose, other = Purpose("response", column, sign), here.get(Purpose("response", column, -sign))
+            if sign < 0 and other is not None:
+                continue  # done with the other sign
+            rows, job = here[purpose], jobs[purpose]
+            step = candidate.parametrization.coordinates(effect)[candidate.columns.index(column)]
+            found[column] = responses(step, rows, other, references[job.source is not None][: len(rows)])
+            each, count = found[column][0][:, : whitening.shape[1]], min(2 * len(rows), settings.noisy_skies)
+            single = analysis.of_maps and candidate.channel is not None
+            if single and count > len(rows) and size_error(each, whitening) > settings.response_error:
+                more[purpose] = replace(job, first=len(rows), count=count - len(rows))
+        if not more:
+            return found
+        for purpose, rows in zip(more, ask(list(more.values())), strict=True):
+            here[purpose] = np.concatenate([here[purpose], rows])
 
 
 def reduced(
@@ -320,23 +306,6 @@ def reduced(
     without = tuple(sorted({*analysis.without, *names}))
     fewer = replace(analysis, candidates=numbered(kept), blocks=blocks, without=without)
     return fewer, ensemble.restrict(rows), bank.subset(rows, columns), rows
-
-
-def responses(step: float, here: Rows, opposite: Rows | None, same: Rows) -> tuple[Rows, Rows]:
-    """Return the linear response in each sky, shape (skies, p), and the curvature of the mean, shape (p,).
-
-    Data vectors with a step and without are those of the same skies, those with the opposite step of the first of them.
-    They give [x(+step) - x(-step)]/(2 step); in the other skies, and of an effect of one sign, the response is
-    [x(step) - x(0)]/step less step times the curvature, which is zero if nothing tells it.
-    """
-    each = (here - same) / step
-    if opposite is None:
-        return each, np.zeros(here.shape[1])
-    both = len(opposite)
-    curvature = np.mean(here[:both] + opposite - 2.0 * same[:both], axis=0) / (2.0 * step**2)
-    each -= step * curvature
-    each[:both] = (here[:both] - opposite) / (2.0 * step)
-    return each, curvature
 
 
 def _results(analysis: Analysis, jobs: dict[Purpose, Job], ask: Ask, pilot: bool) -> dict[Purpose, Rows]:

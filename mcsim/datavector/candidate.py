@@ -296,6 +296,7 @@ class TemplateBank:
     curvature: Matrix  # half the second derivative
     labels: tuple[Column, ...]  # identity of each column
     faint_share: Vector  # what elements that noise hides keep of the matrix, (K,)
+    skies: Vector  # over how many each column is averaged, (K,)
     slice_matrix: Matrix = field(default_factory=lambda: np.zeros((0, 0)))  # of the numbers beside it, (E, K)
 
     def subset(self, rows: NDArray[np.int64], columns: Sequence[int]) -> "TemplateBank":
@@ -303,8 +304,8 @@ class TemplateBank:
         cut = np.ix_(rows, np.asarray(columns, dtype=np.int64))
         labels = tuple(self.labels[column] for column in columns)
         beside = self.slice_matrix[:, list(columns)] if len(self.slice_matrix) else self.slice_matrix
-        share = self.faint_share[list(columns)]
-        return TemplateBank(self.matrix[cut], self.error[cut], self.curvature[cut], labels, share, beside)
+        share, skies = self.faint_share[list(columns)], self.skies[list(columns)]
+        return TemplateBank(self.matrix[cut], self.error[cut], self.curvature[cut], labels, share, skies, beside)
 
     def with_columns(self, labels: Sequence[Column], response: Matrix) -> "TemplateBank":
         """Return the bank with further columns: linear responses without error of all elements, shape (p + E, K)."""
@@ -315,6 +316,7 @@ class TemplateBank:
             np.concatenate([self.curvature, exact], axis=1),
             (*self.labels, *labels),
             np.concatenate([self.faint_share, np.ones(len(labels))]),
+            np.concatenate([self.skies, np.ones(len(labels))]),
             np.concatenate([self.slice_matrix, response[size:]], axis=1),
         )
 
@@ -335,18 +337,18 @@ class TemplateBank:
         """Return the matrix; of :meth:`faint` elements the share that is not noise."""
         return np.where(self.faint(spread, settings), self.faint_share * self.matrix, self.matrix)
 
-    def sky_scatter(self, spread: Vector, candidates: Sequence[Candidate], skies: Sequence[int]) -> Vector:
+    def sky_scatter(self, spread: Vector, candidates: Sequence[Candidate]) -> Vector:
         """Return the rms scatter of the response among skies over the mean response, shape (candidates,).
 
-        Norms are of elements over their standard deviation ``spread``, all columns of a candidate together; ``skies``
-        is the number of skies of each candidate's response. Infinite if all columns are noise.
+        Norms are of elements over their standard deviation ``spread``, all columns of a candidate together. Infinite if
+        all columns are noise.
         """
         noise, size = self._squares(spread)
         found = []
-        for candidate, number in zip(candidates, skies, strict=True):
+        for candidate in candidates:
             # A column of nothing but noise says nothing of the others.
             rows = [column for column in candidate.columns if size[column] > 2.0 * noise[column]]
-            ratio = number * noise[rows] / (size[rows] - noise[rows])
+            ratio = self.skies[rows] * noise[rows] / (size[rows] - noise[rows])
             found.append(float(np.sqrt(np.mean(ratio))) if rows else np.inf)
         return np.array(found)
 

@@ -194,6 +194,7 @@ def without_nuisances(simulations: Matrix, nuisances: Matrix | None) -> Matrix:
 def save(path: Path, ensemble: NullEnsemble, bank: TemplateBank) -> None:
     """Write an ensemble and the templates to a new Zarr store: every array by its name."""
     values = {f.name: getattr(one, f.name) for one in (ensemble, bank) for f in fields(one)}
+    values |= {"response_skies": values.pop("skies")}  # the ensemble's are an attribute
     arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
     attributes = {
         "elements": json.dumps([asdict(element) for element in ensemble.elements]),
@@ -217,9 +218,9 @@ def load(path: Path) -> tuple[NullEnsemble, TemplateBank]:
         columns = TypeAdapter(tuple[Column, ...]).validate_json(dataset.attrs["columns"])
         redundant, shrunk = float(dataset.attrs["redundant"]), bool(dataset.attrs["shrunk"])
         skies = int(dataset.attrs["skies"])
-    names = "matrix", "error", "curvature", "faint_share", "slice_matrix"
-    matrix, error, curvature, share, beside_matrix = map(arrays.pop, names)
-    bank = TemplateBank(matrix, error, curvature, columns, share, beside_matrix)
+    names = "matrix", "error", "curvature", "faint_share", "response_skies", "slice_matrix"
+    matrix, error, curvature, *rest = map(arrays.pop, names)
+    bank = TemplateBank(matrix, error, curvature, columns, *rest)
     kept = NullEnsemble(
         **arrays, elements=elements, slice_elements=beside, redundant=redundant, shrunk=shrunk, skies=skies
     )

@@ -13,6 +13,7 @@ _FIRST = {
     "sims_per_element": 2,
     "pilot_sims_per_element": 2,
     "worth_per_element": 7.0,
+    "response_error": 0.15,
     "channel_skies": 2,
     "typical_skies": 3,
     "common_skies": 6,
@@ -100,6 +101,9 @@ class DiagnosisSettings:
         Directions of the data vector with less than this fraction of the largest variance are dropped.
     response_modes
         (lmax + 1)^2 times skies over which a response is averaged: its noise is below 3e-3 of its Fisher matrix.
+    response_error
+        Relative error of the size of a response in one channel (its upper limit by the scatter among skies) above which
+        it is averaged over twice as many, and again, ``noisy_skies`` at most.
     channel_skies, typical_skies, common_skies, noisy_skies
         Least number of skies over which a response is averaged: in one channel; of a sky with another mean response;
         of a sky whose response in one realization is mostly random; if the change itself is random or has one sign.
@@ -225,6 +229,7 @@ class DiagnosisSettings:
     shrunk: bool = True
     redundant: float = 1e-4
     response_modes: int = 1 << 14
+    response_error: float = 0.07
     channel_skies: int = 3
     typical_skies: int = 6
     common_skies: int = 12

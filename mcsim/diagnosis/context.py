@@ -10,7 +10,7 @@ import numpy as np
 
 from mcsim import config
 from mcsim.datavector.analysis import Analysis
-from mcsim.datavector.campaign import Ask, after_jobs, skies, without_repeats
+from mcsim.datavector.campaign import Ask, after_jobs, without_repeats
 from mcsim.datavector.candidate import Candidate, TemplateBank
 from mcsim.datavector.localisation import Place
 from mcsim.datavector.nuisances import with_nuisances
@@ -77,8 +77,7 @@ class DiagnosisContext:
 
 def context(analysis: Analysis, ensemble: NullEnsemble, bank: TemplateBank) -> DiagnosisContext:
     """Prepare the tests of data sets of a model."""
-    null, count = ensemble.gaussian, [skies(analysis, candidate) for candidate in analysis.candidates]
-    scatter = bank.sky_scatter(ensemble.spread, analysis.candidates, count)
+    null, scatter = ensemble.gaussian, bank.sky_scatter(ensemble.spread, analysis.candidates)
     candidates = tuple(
         # What a stochastic effect draws is not known even if the sky is.
         replace(candidate, shape_error=min(float(own), 1.0) if candidate.random_response else None)

@@ -62,7 +62,7 @@ def toy(names, simulations=800, seed=1, common=0.0):
     )
     model = SimpleNamespace(lmax=128, sky_power=np.ones(129), settings=DiagnosisSettings())
     labels = tuple(label for candidate in candidates for label in candidate.labels)
-    bank = TemplateBank(t, np.zeros_like(t), np.zeros_like(t), labels, np.ones(t.shape[1]))
+    bank = TemplateBank(t, np.zeros_like(t), np.zeros_like(t), labels, *np.ones((2, t.shape[1])))
     return context(Analysis(model, candidates, tuple(blocks)), ensemble, bank)
 
 

@@ -81,7 +81,9 @@ def test_a_rival_takes_the_place_of_as_many_members_as_it_can(named):
 def test_columns_are_added_behind_those_of_a_bank():
     rng, labels = np.random.default_rng(6), candidate("a", None).labels
     matrix, more = rng.normal(size=(4, 1)), rng.normal(size=(6, 1))
-    bank = TemplateBank(matrix, 0.1 * matrix, 0.2 * matrix, labels, np.array([0.3]), rng.normal(size=(2, 1)))
+    bank = TemplateBank(
+        matrix, 0.1 * matrix, 0.2 * matrix, labels, np.array([0.3]), np.array([4.0]), rng.normal(size=(2, 1))
+    )
     wide = bank.with_columns(candidate("b", None).labels, more)
     np.testing.assert_array_equal(wide.matrix, np.hstack([matrix, more[:4]]))
     np.testing.assert_array_equal(wide.slice_matrix, np.hstack([bank.slice_matrix, more[4:]]))

@@ -9,7 +9,7 @@ from astropy.table import Table
 from scipy.stats import kstest
 
 from mcsim import bipolar, config, systematics
-from mcsim.datavector import campaign
+from mcsim.datavector import campaign, responses
 from mcsim.datavector import spectra_table as tables
 from mcsim.datavector.analysis import Job
 from mcsim.datavector.campaign import with_effects
@@ -163,7 +163,7 @@ def test_where_the_maps_end_is_part_of_what_a_number_is(tmp_path):
 def test_responses_are_averaged_over_skies_that_are_simulated_without_effects(changes):
     settings = DiagnosisSettings.quick(**changes)
     analysis = SimpleNamespace(of_maps=False, settings=settings)
-    assert campaign.skies(analysis, None) == settings.noisy_skies == 12
+    assert responses.skies(analysis, None) == settings.noisy_skies == 12
 
 
 def test_the_cost_of_a_table_is_that_of_its_numbers(tmp_path):

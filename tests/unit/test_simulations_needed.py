@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mcsim import config
-from mcsim.datavector import campaign
+from mcsim.datavector import campaign, responses
 from mcsim.datavector.analysis import Analysis, Job, analysis_of
 from mcsim.datavector.settings import DiagnosisSettings
 from refusals import refused
@@ -68,14 +68,14 @@ def test_skies_of_many_modes_tell_as_much_in_fewer(four: Analysis) -> None:
     """Twice the modes, half of the skies, down to two, with the opposite step in a third of them."""
     one = next(each for each in four.candidates if each.name == "dipole_modulation")
     model = four.model
-    assert campaign.skies(four, one) == 24  # of a sky with few modes
+    assert responses.skies(four, one) == 24  # of a sky with few modes
     for modes, expected in ((1, 12), (2, 6), (3, 4), (40, 2)):
         lmax = 2 * model.lmax
-        power = np.full(lmax + 1, 1.001 * modes * campaign.MODES / (lmax + 1) ** 2)
+        power = np.full(lmax + 1, 1.001 * modes * responses.MODES / (lmax + 1) ** 2)
         settings = replace(model.settings, response_modes=1)
         own = replace(four, model=replace(model, lmax=lmax, sky_power=power, settings=settings))
-        assert campaign.skies(own, one) == expected
-        assert campaign.skies(own, one, -1) == -(-expected // 3)
+        assert responses.skies(own, one) == expected
+        assert responses.skies(own, one, -1) == -(-expected // 3)
 
 
 def test_without_a_share_of_opposite_steps_none_is_simulated(four: Analysis) -> None:
@@ -92,3 +92,32 @@ def test_workers_that_are_none_are_refused_though_nothing_is_to_be_simulated(wor
     """They were not looked at where the model was in the cache."""
     with refused("workers", workers), campaign.batch(workers):
         pass
+
+
+def test_a_response_whose_size_scatters_is_averaged_over_more_skies(four: Analysis) -> None:
+    """Of one gain by a third: of all skies that there are. Common effects, whose numbers are their own, are not."""
+    few = replace(four, model=replace(four.model, settings=replace(four.settings, response_modes=1)))
+    asked, elements = dict[tuple[str, str | None], list[int]](), len(four.elements)
+    slope = np.random.default_rng(7).standard_normal(elements)
+    scatter = np.random.default_rng(8).standard_normal(four.settings.noisy_skies)
+
+    def respond(job: Job) -> NDArray[np.float64]:
+        [effect] = config.from_json(job.simulated).effects
+        wide = {"calibration": effect.channel == "W1", "dipole_modulation": True}.get(effect.name, False)
+        sizes = 1.0 + (0.3 if wide else 0.01) * scatter[job.first : job.first + job.count]
+        return np.asarray(effect.parameters["amplitude"] * sizes[:, None] * slope)
+
+    def ask(jobs: Sequence[Job]) -> list[NDArray[np.float64]]:
+        for job in jobs:
+            [effect] = config.from_json(job.simulated).effects
+            asked.setdefault((effect.name, effect.channel), []).append(job.first)
+        return [respond(job) for job in jobs]
+
+    jobs = {purpose: job for purpose, job in campaign.plan(few, 10, False).items() if purpose.kind == "response"}
+    results = {purpose: respond(job) for purpose, job in jobs.items()}
+    same = {False: np.zeros((four.settings.noisy_skies, elements))}
+    found = campaign._measured(few, jobs, ask, results, same, np.eye(elements))
+    assert asked == {("calibration", "W1"): [3, 6, 12]}
+    for candidate in few.candidates:
+        number = 24 if candidate.identity == ("calibration", "W1") else responses.skies(few, candidate)
+        assert {len(found[column][0]) for column in candidate.columns} == {number}
