@@ -275,6 +275,7 @@ def _candidates(
     for name in settings.nuisances:
         if name not in known:
             raise InputError(f"nuisance {name!r} is no effect of this model; choose from {', '.join(sorted(known))}.")
+    check_asked(analysis, settings.only)
     priors: dict[tuple[str, str | None], list[Candidate]] = {}
     wanted = []
     for candidate in analysis.candidates:
@@ -292,11 +293,10 @@ def _candidates(
             )
     if all(_is_nuisance(candidate, settings) for candidate in wanted):
         raise InputError(
-            f"no effect is left to compute a limit of (asked for: {', '.join(settings.only) or 'all'}): it is a "
-            "nuisance, or this model lacks what it acts on, such as the times of a scan; ask for one of "
+            f"no effect is left to compute a limit of (asked for: {', '.join(settings.only) or 'all'}), for all of "
+            "them are nuisances; ask for one of "
             f"{', '.join(sorted({candidate.name for candidate in analysis.candidates}))}."
         )
-    check_asked(analysis, settings.only)
     return analysis, numbered(wanted)
 
 

@@ -110,7 +110,7 @@ def test_an_effect_of_a_file_has_a_limit_and_one_that_cannot_act_has_none() -> N
     found = mcsim.limit(model(), settings=mcsim.LimitSettings(only=(file,), dense=True))
     assert {one.name for one in found.effects} == {"gain_step"}
     still = replace(model(), channels=tuple(replace(c, scan=config.ScanParallelTransport()) for c in model().channels))
-    with refused("gain_drift", "beam_width"):
+    with refused("gain_drift", "V1", "hit_averaged"):
         mcsim.limit(
             replace(still, map=replace(still.map, splits=())), settings=mcsim.LimitSettings(only=("gain_drift",))
         )
