@@ -10,8 +10,11 @@ The first is the pseudo-inverse of Seljebotn, Baerland, Eriksen, Mardal & Wehus 
 formula of Woodbury for A = D - Q^t (1 - w) Q. K has the spectrum 1/(1 + g_l), which grows nearly as l(l + 1) up to
 where the noise begins: a Laplacian on these pixels alone stands for it, a sparse matrix that is factorised once.
 
-None of this holds for a sky that is known to have no monopole and no dipole. It is given some power there, and the four
-modes are taken out of the inverse again: M_22 - M_20 M_00^-1 M_02 is the inverse of the rest, if M is that of all.
+None of this holds for a sky that has less power in its monopole and dipole than at l = 2, as one known to have neither.
+It is given q^2 times the power there, as much as at l = 2, and what that adds is taken out of the inverse again
+by Woodbury's formula: with E the four modes, T = q on them and 1 on all others,
+
+    T (M - M E [(q^2 - 1)^-1 + E^t M E]^-1 E^t M) T.
 """
 
 import healpy
@@ -59,8 +62,8 @@ class Preconditioner:
         self._nside = nside
         typical = np.median(precision[precision > 0.0])
         gain = gain * typical / precision.mean()
-        empty = self.lmax >= 2 and not gain[:2].any()
-        if empty:
+        own, faint = gain[:2].copy(), self.lmax >= 2 and bool(gain[:2].max() < gain[2])
+        if faint:
             gain[:2] = gain[2]
         weight = precision / typical
         self._inverse = 1.0 / (1.0 + gain)
@@ -78,22 +81,32 @@ class Preconditioner:
             options = {"SymmetricMode": True}
             self._factors = splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
         self._columns = np.zeros((0, alm_.size(self.lmax)), dtype=np.complex128)
-        if empty:
+        if faint:
+            # Of the monopole, and of three modes of the dipole; nothing comes of modes that the sky has no power in.
+            more = np.array([gain[2] / own[0] if own[0] else np.inf, *[gain[2] / own[1] if own[1] else np.inf] * 3])
+            self._turned, self._added = np.where(np.isfinite(more), np.sqrt(more), 0.0), 1.0 / (more - 1.0)
             units = np.zeros((4, alm_.size(self.lmax)), dtype=np.complex128)
             units[range(4), [0, 1, self.lmax + 1, self.lmax + 1]] = 1.0, 1.0, 1.0, 1.0j
             self._columns = np.stack([self._whole(unit) for unit in units])
 
     def apply(self, sky: Alm) -> Alm:
         """Return about (1 + S^1/2 P^t N^-1 P S^1/2)^-1 applied to coefficients."""
-        found = self._whole(sky)
-        if self._columns.size:
-            corner = [self._lowest(column) for column in self._columns]
-            found = found - np.linalg.solve(np.transpose(corner), self._lowest(found)) @ self._columns
-        return found
+        if not self._columns.size:
+            return self._whole(sky)
+        found = self._whole(self._scaled(sky))
+        corner = np.transpose([self._lowest(column) for column in self._columns])
+        taken = np.linalg.solve(corner + np.diag(self._added), self._lowest(found))
+        return self._scaled(found - taken @ self._columns)
 
     def _lowest(self, sky: Alm) -> Vector:
         """Return the four real numbers of the monopole and the dipole."""
         return np.array([sky[0].real, sky[1].real, sky[self.lmax + 1].real, sky[self.lmax + 1].imag])
+
+    def _scaled(self, sky: Alm) -> Alm:
+        """Return T applied to coefficients."""
+        found, lowest = sky.copy(), self._turned * self._lowest(sky)
+        found[[0, 1, self.lmax + 1]] = lowest[0], lowest[1], lowest[2] + 1j * lowest[3]
+        return found
 
     def _whole(self, sky: Alm) -> Alm:
         """Return the inverse of the system in which the sky has a monopole and a dipole."""
