@@ -69,6 +69,11 @@ class Candidate:
         return self.name, self.channel
 
     @property
+    def claim(self) -> tuple[str, str | None, str | None]:
+        """Return name, channel and split: where it acts, of which a verdict has all that are as probable."""
+        return *self.identity, self.settings.get("split")
+
+    @property
     def labels(self) -> tuple[Column, ...]:
         """Return the identity of each of its columns."""
         return tuple(Column(*self.identity, tuple(self.settings.items()), k) for k in range(len(self.columns)))

@@ -55,7 +55,10 @@ def with_rivals(data: DataSet[Any], refined: Refined, found: Attribution) -> tup
     for members in sets:
         null, z, t = _widest(data, refined, members)
         wide = replace(refined, templates=t)
-        places += [one for one in in_place(null, z, wide, members, known, settings, least) if one not in places]
+        own = [one for one in in_place(null, z, wide, members, known, settings, least) if one not in places]
+        # What one split has, another may have with the other sign: both are simulated before one is named.
+        also = [(other, kept) for rival, kept in own for other in _in_other_splits(known, rival)]
+        places += list(dict.fromkeys([*own, *also]))
     if not places:
         return None
     chosen = list(dict.fromkeys(rival for rival, _ in places))
@@ -65,6 +68,14 @@ def with_rivals(data: DataSet[Any], refined: Refined, found: Attribution) -> tup
     candidates = (*refined.candidates, *data.context.candidates[first:])
     tried = [(*kept, first + chosen.index(rival)) for rival, kept in places]
     return data, Refiner(data).run(straight, candidates, tried, start)
+
+
+def _in_other_splits(rivals: Sequence[tuple[Candidate, Matrix]], index: int) -> Iterator[int]:
+    """Yield the rivals that are one of them in another split."""
+    one = rivals[index][0]
+    for place, (other, _) in enumerate(rivals):
+        if other.identity == one.identity and other.claim != one.claim:
+            yield place
 
 
 def _alone(data: DataSet[Any], rivals: Sequence[tuple[Candidate, Matrix]]) -> Iterator[tuple[int, Matrix]]:

@@ -194,14 +194,14 @@ class Selection:
     _fits: dict[tuple[Subsets, tuple[int, ...]], Fit] = field(default_factory=dict, init=False)
 
     def explanations(self, accepted: Sequence[_Accepted]) -> Iterator[Explanation]:
-        """Yield the most probable first; of those that differ only in settings the most probable one."""
-        seen: set[frozenset[tuple[str, str | None]]] = set()
+        """Yield the most probable first; of those that differ in settings other than a split the most probable one."""
+        seen: set[frozenset[tuple[str, str | None, str | None]]] = set()
         ranked = sorted(accepted, reverse=True)
         for found in ranked:
-            identity = frozenset(self.candidates[member].identity for member in found.members)
+            claims = frozenset(self.candidates[member].claim for member in found.members)
             lost = ranked[0].evidence - found.evidence
-            if lost <= np.log(self.settings.odds_cut) and identity not in seen:
-                seen.add(identity)
+            if lost <= np.log(self.settings.odds_cut) and claims not in seen:
+                seen.add(claims)
                 best = self.fit(found.search, found.members)
                 yield Explanation(found.members, best, float(np.exp(-lost)), found.pvalue, found.further)
 

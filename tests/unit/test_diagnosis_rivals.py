@@ -9,7 +9,7 @@ import pytest
 from mcsim.datavector.candidate import Candidate, TemplateBank, numbered
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.refine import Refined
-from mcsim.diagnosis.rivals import in_place
+from mcsim.diagnosis.rivals import _in_other_splits, in_place
 from mcsim.diagnosis.selection import attribute
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
@@ -92,3 +92,20 @@ def test_columns_are_added_behind_those_of_a_bank():
     assert wide.faint_share.tolist() == [0.3, 1.0]
     assert [one.effect for one in wide.labels] == ["a", "b"]
     assert not replace(bank, slice_matrix=np.zeros((0, 0))).with_columns(labels, more[:4]).slice_matrix.size
+
+
+@pytest.mark.parametrize(("key", "both"), [("split", True), ("calibrated", False)])
+def test_all_splits_that_explain_the_data_are_given(named, key, both):
+    """In one channel an error of one half is one of the other with the other sign: it was named as one's for certain.
+
+    Candidates that differ in another setting are one explanation, with what is most probable.
+    """
+    kind = candidate("b", "V1").effect
+    one, other = (Candidate(kind, "V1", (0,), {key: name}) for name in ("half1", "half2"))
+    assert [*_in_other_splits([(one, named.t[:, [1]]), (other, -named.t[:, [1]])], 0)] == [1] * both
+    candidates = numbered([candidate("a", "V1"), one, other])
+    near = 0.999 * named.t[:, [1]] + np.sqrt(1.0 - 0.999**2) * named.t[:, [4]]
+    t = np.concatenate([named.t[:, :2], -near], axis=1)
+    groups = named.null.whiten_groups(t, [each.columns for each in candidates])
+    found = attribute(named.null, named.x, t, candidates, calibrate(named.null, groups, draws=2000))
+    assert sorted(each.members for each in found.explanations) == ([(1,), (2,)] if both else [(1,)])
