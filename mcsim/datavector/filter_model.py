@@ -80,6 +80,11 @@ class Model:
         """Return 1/C_l, zero where C_l is, uK^-2."""
         return divided(1.0, self.cl)
 
+    def last_shown(self, channel: int | None = None) -> int:
+        """Return the last degree of the sky that a channel shows (None: that any shows): a spectrum may end earlier."""
+        rows = self.response if channel is None else self.response[[channel]]
+        return int(np.max(np.flatnonzero((self.cl > 0.0) & rows.any(axis=0)), initial=2))
+
     @cached_property
     def last_degrees(self) -> NDArray[np.int64]:
         """Return the last degree at which orders s of each channel's beam are measured, (channel, beam_orders + 1).

@@ -140,9 +140,9 @@ def blocks_of(model: Model) -> tuple[Block, ...]:
 
 
 def bins(low: int, high: int, number: int) -> list[tuple[int, int]]:
-    """Return ranges of degrees, both ends included, with about the same number of modes."""
+    """Return ranges of degrees, both ends included, of about as many modes each; of few degrees fewer ranges."""
     edges = np.sqrt(np.linspace(low**2, (high + 1) ** 2, number + 1)).astype(int)
-    return [(int(a), int(b) - 1) for a, b in pairwise(edges)]
+    return [(int(a), int(b) - 1) for a, b in pairwise(edges) if a < b]
 
 
 def ranges_within(edges: Iterable[int], number: int) -> list[tuple[int, int]]:
@@ -193,12 +193,13 @@ def _beam_block(model: Model, part: int) -> Block:
     beam = model.survey.channels[own.channel].site.beam
     top = settings.beam_orders if part == model.of(own.channel)[0] else settings.split_beam_orders
     kernels, elements = [], []
+    shown = model.last_shown(own.channel)
     for s in range(min(top, own.moments.smax) + 1):
         shape = beam.blm[0, : model.lmax + 1].real * (ell / model.lmax) ** max(s, 1)
         # Above these orders the channel's sum is measured, in the place of its first map.
         alike = whole if s <= settings.split_beam_orders else replace(whole, split=None, fold=None)
         alike = replace(alike, L=s, M=0, parity="even", kind="beam")
-        end = int(model.last_degrees[own.channel, s]) if s else model.lmax
+        end = min(int(model.last_degrees[own.channel, s]) if s else model.lmax, shown)
         for low, high in bins(2, end, settings.beam_bins[s]):
             kernel = np.where((ell >= low) & (ell <= high), shape, 0.0)
             for short, component in (("re", "real" if s else None), ("im", "imaginary"))[: 2 if s else 1]:
@@ -394,7 +395,7 @@ def _isotropy_block(model: Model) -> Block:
     x, y, z = healpix.centres(nside)
     forms = np.stack([x, y, z, 1.5 * z**2 - 0.5, x * z, y * z, x**2 - y**2, x * y])
     filters, elements = [], []
-    for fold, (low, high) in enumerate(bins(2, lmax, 2)):
+    for fold, (low, high) in enumerate(bins(2, model.last_shown(), 2)):
         filters.append(np.where((ell >= low) & (ell <= high), model.inverse_cl, 0.0))
         alike = Element("isotropy", "biposh", model.channels, None, fold, (low, high), frame=model.frame)
         for form, (L, M) in _FORMS.items():

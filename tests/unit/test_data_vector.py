@@ -12,7 +12,7 @@ from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.filter_model import model_of
 from mcsim.datavector.map_checks import check_pixels, checked_map
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.datavector.summaries import Element, blocks_of, pair_classes, ranges_within
+from mcsim.datavector.summaries import Element, bins, blocks_of, pair_classes, ranges_within
 from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -47,6 +47,26 @@ def test_no_element_names_degrees_that_the_filters_do_not_have(analysis) -> None
     ends = {element.kind: element.ell for element in elements if element.ell is not None}
     assert max(last for _, last in ends.values()) == analysis.model.lmax
     assert ends["plane"] == (2, analysis.model.lmax)
+
+
+def test_elements_are_of_degrees_that_the_maps_show() -> None:
+    """Bins of a beam where a step in harmonics, or the spectrum, has ended were zero in all simulations: a refusal."""
+    rotated = {"preparation": [{"kind": "rotate", "frame": "galactic"}]}
+    cl = np.append(1000.0 / (1.0 + np.arange(16.0)) ** 2, np.zeros(7))
+    shorter = {"sky": {"spectrum": cl, "lmax": 22}}
+    for changes, last in ((rotated, 16), (shorter, 15)):
+        run = config.load(two_channels("short", lmax=22, nside=8, fwhm_arcmin=500.0) | changes)
+        short = analysis_of(run, without=tuple(catalogue()))
+        ends = [element.ell[1] for element in short.elements if element.kind == "beam"]
+        assert (short.model.lmax, max(ends)) == (22, last)
+        vectors = [short.data_vector(list(simulate.maps(survey(run), number))) for number in range(3)]
+        assert np.std(vectors, axis=0).min() > 0.0
+
+
+@pytest.mark.parametrize(("high", "number", "expected"), [(2, 3, [(2, 2)]), (3, 3, [(2, 2), (3, 3)])])
+def test_few_degrees_make_few_bins(high, number, expected) -> None:
+    """Empty ones made every p-value of a scan of degree 2 alone 1."""
+    assert bins(2, high, number) == expected
 
 
 def test_elements_scale_as_their_units_say(analysis) -> None:
