@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike
 
 from mcsim import config
 from mcsim.config.schema import MapOf
-from mcsim.ensemble.maps import file_names, write_map
+from mcsim.ensemble.maps import POINTING, file_names, write_map
 from mcsim.errors import InputError
 from mcsim.simulation.preparation import preparation
 from mcsim.sphere import spectra
 from mcsim.sphere.checks import UNSEEN_BELOW, check_map, check_not_infinite
+from mcsim.sphere.header import first_table, opened
 from mcsim.sphere.healpix import read_uk
 from mcsim.support.arrays import Map, reals
 from mcsim.support.folders import appearing, not_filled, unwritable, user_path, writable
@@ -128,29 +129,33 @@ def prepare_files(source: Source, files: Sequence[str], folder: str | Path) -> l
     """Prepare FITS files and write them to a new folder, complete or not at all, which :func:`mcsim.diagnose` can read.
 
     Files are ``.../{channel}.fits`` or ``{channel}_{split}.fits``, or NAME=PATH with any path. Unit and frame are those
-    of the header; without them uK and the frame of the run.
+    of the header; without them uK and the frame of the run. What it says of the samples (POINTING) is handed on.
     """
     run = config.load(source)
     target, names = user_path(folder), file_names(run)
     not_filled(target)
-    read: dict[str, Map] = {}
+    read, pointing = dict[str, Map](), dict[str, list[tuple[str, Any]]]()
     for file in files:
-        name, map_uk = _read(run, names, file)
+        name, path = _called(run, names, file)
         if name in read:
             raise InputError(f"map {name} is given twice, the second time as {file}; give each map once.")
-        read[name] = map_uk
+        read[name] = read_uk(path, run.map.frame, _map_called(run, name).channel.frequency_ghz)
+        with opened(path) as hdus:
+            header = first_table(hdus).header
+            pointing[name] = [card for card in POINTING.values() if header.get(card[0]) == card[1]]
     done = prepare(read, run)
     writable(target.absolute().parent)
     keywords = [("RUN", run.name.encode("ascii", "backslashreplace").decode()), ("DIGEST", config.digest(run))]
     with unwritable(target, "choose another folder with -o"), appearing(target) as scratch:
         for name, map_uk in done.items():
-            write_map(scratch / names[name], map_uk, config.prepared_grid(run)[1], keywords)
+            write_map(scratch / names[name], map_uk, config.prepared_grid(run)[1], [*keywords, *pointing[name]])
     return [target / names[name] for name in done]
 
 
-def _read(run: config.RunConfig, names: Mapping[str, str], file: str) -> tuple[str, Map]:
-    """Return the name of a map of the run, and the map of a file in uK."""
+def _called(run: config.RunConfig, names: Mapping[str, str], file: str) -> tuple[str, Path]:
+    """Return the name of a map of the run, and the path of its file: NAME is also what the file would be called."""
     named, equals, path = file.partition("=")
+    named = next((name for name, own in names.items() if own == f"{named}.fits"), named)
     if not equals or (named not in names and os.path.isfile(user_path(file))):
         path, equals = file, ""
         named = next((name for name, own in names.items() if own == Path(file).name), "")
@@ -159,4 +164,4 @@ def _read(run: config.RunConfig, names: Mapping[str, str], file: str) -> tuple[s
         if equals:
             raise InputError(f"{named} of {file} is no map of {run.name}; use one of {', '.join(names)}.")
         raise InputError(f"{file} is none of {known}; rename it, or say which map it is: NAME={file}.")
-    return named, read_uk(user_path(path), run.map.frame, _map_called(run, named).channel.frequency_ghz)
+    return named, user_path(path)

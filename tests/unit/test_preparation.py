@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import healpy
 import numpy as np
 import pytest
+from astropy.io import fits
 
 import mcsim
 from mcsim import config
@@ -446,6 +447,18 @@ def test_files_are_prepared(tmp_path, rng):
     healpy.write_map(path, map_uk, coord="G", overwrite=True, dtype=np.float64)
     with refused(path, "map.frame", "galactic", "ecliptic"):
         prepare_files(run, [str(path)], tmp_path / "other")
+
+
+def test_prepared_files_say_of_samples_what_their_sources_say(tmp_path, rng):
+    """Without POINTING maps of pixel means were tested as maps of samples, with another chi^2."""
+    run = run_with({"kind": "degrade", "nside": COARSE}, map={"nside": FINE, "splits": ["a", "b"]})
+    files = {"V:a": tmp_path / "first.fits", "V_b": tmp_path / "second.fits"}
+    for path, cards in zip(files.values(), ([("POINTING", "pixel means")], []), strict=True):
+        map_uk = 50.0 * rng.standard_normal(NPIX)
+        healpy.write_map(path, map_uk, column_units="uK", coord="E", dtype=np.float64, extra_header=cards)
+    made = prepare_files(run, [f"{name}={path}" for name, path in files.items()], tmp_path / "out")
+    assert [path.name for path in made] == ["V_a.fits", "V_b.fits"]
+    assert [fits.getheader(path, 1).get("POINTING") for path in made] == ["pixel means", None]
 
 
 def test_identity_of_a_run_has_its_preparation():
