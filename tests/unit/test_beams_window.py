@@ -36,7 +36,7 @@ def written(path, *hdus):
 
 def wmap_text(folder):
     path, error = folder / "ampl_bl_W1.txt", np.full(LMAX + 1, 0.01)
-    header = "WMAP beam transfer function as well as its error\n l  B_l  fractional error"
+    header = "WMAP beam amplitude transfer function as well as its error; not W_l = B_l^2\n l  B_l  fractional error"
     np.savetxt(path, np.stack([np.arange(LMAX + 1), WINDOW, error], axis=1), fmt=["%d", "%.17g", "%g"], header=header)
     return path
 

@@ -74,7 +74,8 @@ def _of_text(path: Path) -> Window:
         warnings.simplefilter("ignore", UserWarning)  # of an empty file, which is refused
         table = np.loadtxt(path, ndmin=2)
         comments = [line.strip() for line in path.read_text("utf-8", "replace").splitlines() if line.startswith("#")]
-    if said := next((line for line in comments if _SAID_SQUARED.search(line)), None):
+    said = next((line for line in comments if _SAID_SQUARED.search(line)), None)
+    if said is not None and not re.search("(?i)ampl", " ".join(comments)):  # that of B_l may say what its square is
         raise InputError(f"{path} says {said[:60]!r}, so it seems to hold W_l = B_l^2; give the file of B_l.")
     if table.shape[1] == 1:
         return np.asarray(table[:, 0])
