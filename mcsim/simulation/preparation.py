@@ -224,13 +224,12 @@ def preparation(
     smoothed: NDArray[np.float64] | None = None
     for step in run.preparation:
         of_data = isinstance(step, declared.Templates) and bool(step.coefficients) and not step.simulated
-        if spec.name not in (getattr(step, "channels", ()) or (spec.name,)) or (of_data and not observed):
-            pass
-        elif isinstance(step, declared.Smooth):
-            change, smoothed = _change_of_beam(step, spec, 3 * nside - 1, smoothed)
-            steps.append(Filter("smooth", nside, nside, change, np.ones(change.size)))
-        else:
-            steps.append(_step(step, spec, split, nside, frame))
+        if spec.name in (getattr(step, "channels", ()) or (spec.name,)) and (observed or not of_data):
+            if isinstance(step, declared.Smooth):
+                change, smoothed = _change_of_beam(step, spec, 3 * nside - 1, smoothed)
+                steps.append(Filter("smooth", nside, nside, change, np.ones(change.size)))
+            else:
+                steps.append(_step(step, spec, split, nside, frame))
         nside, frame = declared.grid_after([step], nside, frame)
     return Preparation(tuple(steps), nside, frame)
 
