@@ -250,8 +250,7 @@ class SameSkies:
         """Return True for an effect on the observed sky that makes a monopole or a dipole of its other degrees."""
         built = systematics.build(dict(self.analysis.library)[effect.name], dict(effect.parameters))
         site = self.analysis.model.survey.channels[0].site
-        few = replace(site, lmax=min(site.lmax, FEW))
-        return self.skies_of(effect) == "constrained" and makes_means(built, few)
+        return self.skies_of(effect) == "constrained" and makes_means(built, site)
 
     def _changes_power(self, effect: config.Effect) -> bool:
         """Return True for what a beam, or a pixel, does to the power of the sky of the only channel."""
@@ -346,6 +345,7 @@ def makes_means(effect: systematics.Effect, site: systematics.Site) -> bool:
     """Return True if an effect that draws nothing makes a monopole or a dipole of the other degrees of the sky."""
     if effect.parametrization.stochastic or not systematics.acts_through(effect, "sky"):
         return False
+    site = replace(site, lmax=min(site.lmax, FEW))
     ell, m = degrees(site.lmax), orders(site.lmax)
     sky = np.asarray(np.where(ell > 1, 1.0 + 1.0j * (m > 0), 0.0), dtype=np.complex128)
     with_sky, alone = (effect.sky(one, site, lambda stage: np.random.default_rng(0)) for one in (sky, 0.0 * sky))

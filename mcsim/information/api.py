@@ -12,6 +12,7 @@ import numpy as np
 from mcsim import config, systematics
 from mcsim.datavector.analysis import Analysis, analysis_of, check_asked
 from mcsim.datavector.candidate import Candidate, numbered
+from mcsim.datavector.same_skies import makes_means
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.errors import InputError
 from mcsim.information import figure
@@ -130,6 +131,9 @@ def limit(
         method += ", marginalised over what [[preparation]] subtracts from the maps"
     tests = sum(not _is_nuisance(candidate, settings) for candidate in analysis.candidates)
     found = limits_of(candidates, information, tests, method, run.name, settings)
+    if not cl[:2].any() and not settings.unknown_dipole_uk and all(m.templates is None for m in filtered.maps):
+        site = analysis.model.survey.channels[0].site
+        found = replace(found, no_dipole=tuple(c.title for c in candidates if makes_means(c.basis[0], site)))
     if output is not None:
         found.save(output, page.png(figure.limit_figure(found), DOTS_PER_INCH))
     return found

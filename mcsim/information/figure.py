@@ -37,7 +37,9 @@ def limit_figure(found: Limits) -> Figure:
     starred = np.array([one.amplitude("separable").endswith("*") for one in effects])
     style: dict[str, Any] = {"markersize": 9, "markeredgewidth": 1.6, "linestyle": "none", "color": "black"}
     left.plot(apart[inside], rows[inside], marker="|", label="told apart from the most similar", **style)
-    left.plot([0.97 * REACH] * int(np.sum(beyond)), rows[beyond], marker="$>$", label="beyond", **style)
+    left.plot(
+        [0.97 * REACH] * int(np.sum(beyond)), rows[beyond], marker="$>$", label="that lies farther right", **style
+    )
     left.plot([0.92 * REACH] * int(np.sum(beyond & starred)), rows[beyond & starred], "*", color="black", markersize=5)
     _hatch_impossible(left, found)
     beside: dict[str, Any] = {"va": "center", "fontsize": 7, "parse_math": False}

@@ -92,6 +92,9 @@ class Limits:
         How the matrix was computed, in words.
     settings
         With which it was computed.
+    no_dipole
+        Titles of the effects that are known from the monopole and the dipole that they make, where the spectrum says
+        that the sky has none.
     """
 
     model: str
@@ -102,6 +105,7 @@ class Limits:
     tests: int
     method: str
     settings: LimitSettings
+    no_dipole: tuple[str, ...] = ()
 
     @property
     def impossible(self) -> bool:
@@ -122,7 +126,7 @@ class Limits:
 
     @property
     def unknowns(self) -> str:
-        """Say what is marginalised; empty: nothing."""
+        """Say what is marginalised, and what is known of the dipole of the sky; empty: nothing."""
         known = []
         for name, width in self.settings.nuisances.items():
             kind = (self.settings.library or {}).get(name.partition(":")[0])
@@ -130,7 +134,13 @@ class Limits:
             known.append(f"{name} ± {width:g}" + (" (its mean shape alone)" if drawn else ""))
         if self.settings.unknown_dipole_uk:
             known.append(f"a monopole and dipole of {self.settings.unknown_dipole_uk:g} µK rms")
-        return f"Marginalised over {', '.join(known)}." if known else ""
+        said = [f"Marginalised over {', '.join(known)}."] if known else []
+        if self.no_dipole:
+            said.append(
+                "The spectrum has no monopole and no dipole, so that those of the maps tell most of "
+                f"{' and '.join(', '.join(self.no_dipole).rsplit(', ', 1))}; --unknown-dipole-uk 100 leaves that out."
+            )
+        return " ".join(said)
 
     def lines(self) -> list[str]:
         """Return the table as text."""

@@ -282,6 +282,9 @@ def test_unknown_dipole_hides_one_that_all_maps_share() -> None:
     modulated = replace(settings, only=("dipole_modulation",), dense=True)
     known, found = (mcsim.limit(run, settings=replace(modulated, unknown_dipole_uk=rms)) for rms in (0.0, 1e3))
     assert found.effects[0].sigma > 1.1 * known.effects[0].sigma
+    assert (len(known.no_dipole), found.no_dipole) == (1, ())
+    assert "unknown-dipole" in known.lines()[-1]
+    assert "unknown-dipole" not in found.unknowns
 
 
 @pytest.mark.slow
