@@ -442,4 +442,4 @@ def _place_json(place: Place) -> dict[str, Any]:
     found = {key: getattr(e, key) for key in ("statistic", "channels", "split", "L", "M", "parity", "ell", "frame")}
     found["statistic"] = {"score": "map", "noise": "cl"}.get(e.statistic, e.statistic)
     lists = {key: list(value) for key, value in found.items() if isinstance(value, tuple)}
-    return found | lists | {"z": place.z, "p": place.p}
+    return found | lists | {"measured": e.family, "z": place.z, "p": place.p}

@@ -105,6 +105,7 @@ def test_an_ellipticity_is_named_and_its_gap_shrinks(small, tmp_path):
     assert abs(shrink["achieved"] - shrink["predicted"]) < 4 * np.hypot(shrink["sigma"], shrink["sigma_predicted"])
     assert "alternate bins" in verdict["shrink"]["data"]
     first = verdict["where"][0]
+    assert first["measured"] == "measured spectrum"
     assert (first["statistic"], first["frame"], first["L"], first["M"]) == ("biposh", "ecliptic", 2, 0)
     assert "BipoSH L = 2, M = 0, d = 0, real" in report.page(found)
 
