@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mcsim.bipolar import Mode, bennett_factor, parse_mode
 from mcsim.bipolar.modes import bin_factor
-from mcsim.ensemble import opening, store
+from mcsim.ensemble import opening, store, tables
 from mcsim.errors import InputError
 from mcsim.support.arrays import divided
 from mcsim.support.folders import user_path
@@ -104,6 +104,7 @@ class Measurement:
     realizations: NDArray[np.float64] | None = None  #: data vectors of the realizations, shape (N, p), if known
     highest: int | None = None  #: highest degree of the maps of the data; ``None``: not known, that of the model
     count: int = 1  #: number of realizations whose mean the data are
+    unfitted: tuple[str, ...] = ()  #: modes of the pair that are detected in the store but not fitted, strongest first
 
     @property
     def of_one_map(self) -> bool:
@@ -180,7 +181,19 @@ def from_store(path: str | Path, selection: Selection = EVERYTHING) -> Measureme
         raise InputError(f"{path} has no {min(absent).name} for the pair {label} at these ell; leave the mode out.")
     drawn = drawn[:, measured]
     value, covariance = drawn.mean(axis=0), _covariance(drawn) / len(drawn)
-    return Measurement(str(path), label, chosen, kept, SUMMARY, value, covariance, len(drawn), drawn, lmax, len(drawn))
+    fitted, count = {row.mode.name for row in kept}, len(drawn)
+    others = tuple(name for name in _detected(path, chosen, label) if name not in fitted)
+    return Measurement(str(path), label, chosen, kept, SUMMARY, value, covariance, count, drawn, lmax, count, others)
+
+
+def _detected(path: str | Path, kind: Kind, pair: str) -> list[str]:
+    """Return the modes that are detected in the summary of a store, none without one."""
+    if not (user_path(path) / "summary").is_dir():
+        return []
+    with opening.open_summary(path) as summary:
+        suffix = "_difference" if kind == "difference" else ""
+        names = [f"biposh{suffix}_binned_{what}" for what in ("mean", "standard_error")]
+        return tables.detected(opening.read_in(summary[[*names, "count"]], path), suffix, pair)
 
 
 def refuse_filtered(path: str | Path, name: str) -> None:

@@ -85,6 +85,7 @@ class Fit:
             "pair": self.measured.pair,
             "kind": self.measured.kind,
             "modes": [mode.name for mode in self.measured.modes],
+            "unfitted": list(self.measured.unfitted),
             "parameters": named(solution.parameters),
             "errors": named(solution.errors),
             "correlation": solution.correlation.tolist(),

@@ -76,6 +76,8 @@ def report(fits: Sequence[Fit]) -> str:
         f"  {_order(fits)}",
         f"  {_tests(data.simulations)}",
     ]
+    if data.unfitted:
+        lines.append(f"  also detected in {data.origin}, and not fitted: {', '.join(data.unfitted)} (--mode adds them)")
     for one in fits:
         lines += _model(one)
     for small, large, test in comparisons(fits):
@@ -113,7 +115,7 @@ def _model(one: Fit) -> list[str]:
         f"{solution.reduced_chi2:.2f}, p = {solution.probability:.3g}"
     ]
     if len(solution.parameters) == 2:
-        lines.append(f"    correlation {solution.correlation[0, 1]:.3f}")
+        lines.append(f"    correlation of {' and '.join(one.model.parameters)} {solution.correlation[0, 1]:.3f}")
     if one.model.name == "orientation":
         angles = orientation(one)
         lines.append(

@@ -4,6 +4,7 @@ import json
 import os
 import warnings
 from pathlib import Path
+from statistics import NormalDist
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -42,6 +43,14 @@ def strongest(summary: xr.Dataset, kind: str) -> pd.DataFrame:
     rows = spectra(summary, kind)
     best = rows.loc[rows.groupby(["pair", "mode"])["sigma"].idxmax()]
     return best[best["sigma"] > 0.0].sort_values("sigma", ascending=False, kind="stable")
+
+
+def detected(summary: xr.Dataset, kind: str, pair: str, level: float = 1e-3) -> list[str]:
+    """Return the modes of a pair with a bin that is significant at a level for all bins, the strongest first."""
+    rows = spectra(summary, kind)
+    needed = -NormalDist().inv_cdf(0.5 * level / max(int((rows["sigma"] > 0.0).sum()), 1))
+    best = strongest(summary, kind)
+    return best[(best["pair"] == pair) & (best["sigma"] > needed)]["mode"].to_list()
 
 
 def table(summary: xr.Dataset) -> Table:

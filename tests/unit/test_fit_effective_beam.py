@@ -107,6 +107,24 @@ def test_covariances_of_two_maps_are_those_of_such_a_pair(tmp_path):
         with_covariance_of(replace(measured, pair="A,B"), alone)
 
 
+def test_spectra_that_are_detected_and_not_fitted_are_named(tmp_path):
+    """An ellipse of axis ratio 1.5, in parallel transport and with control, shows in d = 0 and d = 2."""
+    beam = {"kind": "elliptical_gaussian", "fwhm_major_arcmin": 900.0, "fwhm_minor_arcmin": 600.0}
+    channel = {"name": "W1", "beam": beam, "scan": {"kind": "parallel_transport"}}
+    run = SMALL | {
+        "channel": [channel | {"noise": {"sigma0_uk": 0.0}}],
+        "map": {"nside": 16},
+        "biposh": {"L_max": 2, "summary_bin": 8},
+        "ensemble": {"realizations": 24, "seed": 3, "paired": True},
+        "compute": {"workers": 1},
+    }
+    store = mcsim.run(run, tmp_path / "ellipse.zarr").store
+    found = fit(from_store(store, Selection(modes=["L2M0d0"])), survey(config.load(run)), "constant")
+    assert found.measured.unfitted[0] == "L2M0d2"
+    assert "L2M0d2 (--mode" in report([found])
+    assert from_store(store).unfitted == ()
+
+
 @pytest.mark.parametrize(
     ("name", "factor", "truth"),
     [
