@@ -32,15 +32,15 @@ def sentence(result: DiagnosisResult) -> str:
     if result.orders:
         return f"{start}. {' '.join(result.orders)}"
     if result.kind == "unknown":
-        partly = ""
-        if len(result.partial) > 1 and result.partial_left is not None:
-            left = f"{100 * result.partial_left:.0f} % of the excess χ²"
-            partly = f" Detected are {_effects(result.partial)}; they leave {left}."
+        missing = "".join(f" What is missing {one.says}." for one in (result.unlisted or ())[:1])
         if result.contradicted:
             sets = "; and ".join(_effects(one.effects) for one in result.contradicted[: SETS + 1])
-            return f"{start}. Parts of the data do not bear out what fits the data vector: {sets}."
+            return f"{start}. Parts of the data do not bear out what fits the data vector: {sets}.{missing}"
+        if len(result.partial) > 1 and result.partial_left is not None:
+            left = f"{100 * result.partial_left:.0f} % of the excess χ²"
+            missing += f" Detected are {_effects(result.partial)}; they leave {left}."
         chance = ", which may be chance" if result.test.pvalue > DISAGREES else ""
-        return f"{start}{chance}, and no effect of the library explains why.{partly}"
+        return f"{start}{chance}, and no effect of the library explains why.{missing}"
     if result.kind == "degenerate":
         shown = [_effects(one.effects) for one in result.sets[: SETS + 1]]
         more = len(result.sets) - len(shown)

@@ -91,6 +91,13 @@ def test_a_reduction_that_no_effect_can_make_is_said_so(files, why):
     assert why in words.unlisted(SimpleNamespace(unlisted=found, unlisted_held_out=None))[-1]
 
 
+@pytest.mark.parametrize("found", [(), (SimpleNamespace(says="is proportional to the sky, W1 alone"),)])
+def test_a_verdict_without_a_name_says_what_is_missing(found):
+    nothing = {"faint": False, "orders": (), "contradicted": (), "partial": (), "partial_left": None}
+    result = SimpleNamespace(kind="unknown", test=SimpleNamespace(pvalue=1e-9), unlisted=found, **nothing)
+    assert words.sentence(result).endswith("is proportional to the sky, W1 alone.") == bool(found)
+
+
 def test_coefficients_that_are_real_are_printed_without_what_rounding_leaves():
     """At M = 0 even parity is real and odd parity imaginary, whatever the size of the other part."""
     expected = mcsim.predict("tiny")
