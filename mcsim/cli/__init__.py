@@ -428,11 +428,13 @@ def config(
         # They load slowly: what cannot be read is said before.
         from mcsim.simulation.channels import check_beams, check_effects, check_scans
         from mcsim.simulation.nuisance import check_nuisances
+        from mcsim.simulation.preparation import check_preparations
 
         check_beams(loaded)
         check_scans(loaded)
         check_effects(loaded)
         check_nuisances(loaded)
+        check_preparations(loaded)
         plain = {"digest": config_.digest(loaded), **config_.complete(loaded)}
         print(json.dumps(plain, indent=2, ensure_ascii=False))
     else:

@@ -81,6 +81,8 @@ def prepare(maps: Mapping[str, ArrayLike] | Sequence[ArrayLike], source: Source)
     >>> prepared["W"].shape, bool(abs(prepared["W"]).max() < 0.1)
     ((768,), True)
     """
+    if isinstance(maps, str | Path | config.RunConfig) or (isinstance(maps, Mapping) and "channel" in maps):
+        raise InputError("maps are a configuration, not maps; give maps first, as in mcsim.prepare(maps, run).")
     run = config.load(source)
     if not run.preparation:
         raise InputError(f"{run.name} has no [[preparation]], so there is nothing to do; declare its steps.")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.config import preparation as declared
+from mcsim.config.messages import standing
 from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam, read_window
 from mcsim.instrument.scan import Moments
@@ -222,16 +223,23 @@ def preparation(
     nside, frame = run.map.resolution, str(run.map.frame)
     steps: list[Step] = []
     smoothed: NDArray[np.float64] | None = None
-    for step in run.preparation:
+    for number, step in enumerate(run.preparation):
         of_data = isinstance(step, declared.Templates) and bool(step.coefficients) and not step.simulated
         if spec.name in (getattr(step, "channels", ()) or (spec.name,)) and (observed or not of_data):
-            if isinstance(step, declared.Smooth):
-                change, smoothed = _change_of_beam(step, spec, 3 * nside - 1, smoothed)
-                steps.append(Filter("smooth", nside, nside, change, np.ones(change.size)))
-            else:
-                steps.append(_step(step, spec, split, nside, frame))
+            with standing(run, f"preparation[{number}]"):
+                if isinstance(step, declared.Smooth):
+                    change, smoothed = _change_of_beam(step, spec, 3 * nside - 1, smoothed)
+                    steps.append(Filter("smooth", nside, nside, change, np.ones(change.size)))
+                else:
+                    steps.append(_step(step, spec, split, nside, frame))
         nside, frame = declared.grid_after([step], nside, frame)
     return Preparation(tuple(steps), nside, frame)
+
+
+def check_preparations(run: config.RunConfig) -> None:
+    """Raise InputError for steps that cannot be applied to the maps of a run, observed or simulated."""
+    for one in run.each_map:
+        preparation(run, one.channel, one.split, observed=True)
 
 
 def _step(step: declared.OtherStep, spec: config.Channel, split: str | None, nside: int, frame: str) -> Step:
@@ -288,8 +296,8 @@ def _change_of_beam(
     change: NDArray[np.float64] = target[:end] / own[:end]
     if end == 0 or np.abs(change).max() > LARGEST_GAIN:
         raise InputError(
-            f"a target beam of a preparation is narrower than the beam of the maps of {spec.name} there, and would "
-            f"amplify them more than {LARGEST_GAIN:g} times; choose a wider target."
+            f"the target beam is narrower than the beam that the maps of {spec.name} have there, and would amplify "
+            f"them more than {LARGEST_GAIN:g} times; choose a wider target."
         )
     return change, target[:end]
 

@@ -165,6 +165,12 @@ def test_config_refuses_a_beam_that_run_refuses(mcsim: Command, tmp_path: Path) 
     refused_by_config_and_run(mcsim, "6000.0")
 
 
+def test_config_refuses_a_preparation_that_run_refuses(mcsim: Command, tmp_path: Path) -> None:
+    steps = "".join(f'[[preparation]]\nkind = "smooth"\nfwhm_arcmin = {width}\n' for width in (1200.0, 320.0))
+    (tmp_path / "small.toml").write_text(f"{SMALL}\n{steps}")
+    refused_by_config_and_run(mcsim, "preparation[1]")
+
+
 def refused_by_config_and_run(mcsim: Command, key: str) -> None:
     """Check that ``config``, ``run`` and ``run --dry-run`` refuse small.toml with one sentence, by file and key."""
     answers = [

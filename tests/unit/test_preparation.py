@@ -472,3 +472,10 @@ def test_identity_of_a_run_has_its_preparation():
 def test_weights_and_regression_follow_their_steps():
     assert Weighted(BAND).local(np.ones(NPIX))[BAND == 0.0] == pytest.approx(np.nan, nan_ok=True)
     assert Regression(np.ones((1, NPIX)), np.ones(NPIX)).beam_window(3).tolist() == [1.0] * 4
+
+
+def test_maps_and_run_in_the_wrong_order_are_refused():
+    maps = {"V": np.zeros(12 * FINE**2)}
+    for given in (run_with({"kind": "subtract_dipole"}), "quickstart", {"channel": [], "map": {}}):
+        with refused("mcsim.prepare(maps, run)"):
+            mcsim.prepare(given, maps)

@@ -96,5 +96,5 @@ def test_a_second_smoothing_starts_from_the_target_of_the_first():
 
 
 def test_a_second_target_that_is_narrower_than_the_first_is_refused():
-    with refused("V", "narrower", 10):
+    with refused("V", "narrower", "preparation[1]", 10):
         survey(run_with(smooth(12.0), smooth(6.0)))
