@@ -117,8 +117,13 @@ Simulations = Annotated[int | None, Option(min=50, help="For a sample covariance
 Processes = Annotated[int | None, Option(min=1, help="Local processes; default: the configuration's.")]
 Scheduler = Annotated[str | None, Option(metavar="ADDRESS", help="Running Dask scheduler, tcp://host:port.")]
 Part = Annotated[str | None, Option(metavar="A:B", help="Only realizations A to B - 1; default: all.")]
-Png = Annotated[Path | None, Option("-o", "--output", metavar="PNG", help="Default: beside what it shows.")]
+Png = Annotated[
+    Path | None,
+    Option("-o", "--output", metavar="FILE", help=".png, .pdf, .svg or such; default: beside what it shows."),
+]
 
+
+DOTS_PER_INCH = 150  #: of pictures that are made of pixels
 
 PICTURES = (".png", ".pdf", ".svg", ".eps", ".ps", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 """Ends of the names of pictures; matplotlib would add .png to a name without one."""
@@ -161,7 +166,7 @@ def save(figure, path: Path, aside: bool = False) -> None:  # type: ignore[no-un
     """
     buffer = BytesIO()
     try:
-        figure.savefig(buffer, format=path.suffix[1:].lower())
+        figure.savefig(buffer, format=path.suffix[1:].lower(), dpi=DOTS_PER_INCH)
     except ValueError as error:
         raise InputError(f"{path} cannot be written ({error}); choose another file with -o.") from error
     with unwritable(path, "choose another file with -o"):

@@ -98,6 +98,7 @@ def plot(
     pair: Annotated[str | None, Option(help='Pair of maps, for example "W1,W1"; default: the first.')] = None,
     predict: Annotated[str | None, Option(metavar="CONFIG", help="Draw its prediction, or that of predict -o.")] = None,
     exact: Annotated[bool, Option("--exact", help="The prediction to all orders in the beam.")] = False,
+    bare: Annotated[bool, Option("--no-caption", help="Draw neither title nor notes, as for a paper.")] = False,
 ) -> None:
     """Draw the binned spectra of a store with error bars, and optionally a prediction."""
     from mcsim.ensemble import prediction, tables
@@ -115,7 +116,7 @@ def plot(
         expected = tables.read_prediction(predict)
     elif predict is not None:
         expected = prediction.predict(predict, exact=exact, nthreads=os.cpu_count() or 1)
-    figure = ensemble_figure(store, L=L, M=M, d=d, pair=pair, prediction=expected)
+    figure = ensemble_figure(store, L=L, M=M, d=d, pair=pair, prediction=expected, caption=not bare)
     save(figure, target)
 
 

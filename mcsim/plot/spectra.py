@@ -2,16 +2,22 @@
 
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from mcsim.ensemble import opening
 from mcsim.errors import InputError
 
 _COLOURS = ("#1f5fa8", "#c44e22", "#3c8c3c", "#7b4fa3", "#8c6d1f", "#1f8f94")
+
+_LEGEND: dict[str, Any] = {"fontsize": 8, "frameon": False}
 
 SIGNAL, DWARFED = 5.0, 5.0
 """Errors from zero that make a signal of a point; height of axes, over that of the points, that hides it."""
@@ -24,12 +30,13 @@ def ensemble_figure(
     d: int | None = None,
     pair: str | None = None,
     prediction: xr.Dataset | None = None,
+    caption: bool = True,
 ) -> Figure:
     """Draw the binned BipoSH spectra of one pair of maps.
 
     ``path``: store with a summary. ``L``, ``M``, ``d``: draw only these; by default one panel for every L > 0 and M (L
     = 0 if there is no other). ``pair``: label of the pair; by default the first. ``prediction``: prediction by
-    :func:`mcsim.predict`, drawn as dashed lines. Raise InputError if the selection is empty, or the prediction is in
+    :func:`mcsim.predict`, drawn as dashed lines. ``caption``: with a title, and with notes below. Raise InputError if the selection is empty, or the prediction is in
     another frame or lacks the pair or a mode.
     """
     with opening.open_summary(path) as summary:
@@ -53,7 +60,8 @@ def ensemble_figure(
             f"{path} has no mode with {asked or 'finite values'} of the pair {label}; mcsim info names what it holds."
         )
     expected = None if prediction is None else _matching(prediction, label, modes)
-    return _draw(modes, f"{Path(path).name}: {label.replace(',', ' × ')}, {int(modes['count'])} realizations", expected)
+    title = f"{Path(path).name}: {label.replace(',', ' × ')}, {int(modes['count'])} realizations"
+    return _draw(modes, title if caption else None, expected)
 
 
 def _matching(prediction: xr.Dataset, pair: str, modes: xr.Dataset) -> xr.Dataset:
@@ -71,12 +79,13 @@ def _matching(prediction: xr.Dataset, pair: str, modes: xr.Dataset) -> xr.Datase
     return prediction.sel(pair=pair, mode=modes["mode"].values)
 
 
-def _draw(modes: xr.Dataset, title: str, expected: xr.Dataset | None) -> Figure:
+def _draw(modes: xr.Dataset, title: str | None, expected: xr.Dataset | None) -> Figure:
+    """Draw a panel for each L and M; ``title`` None: neither title nor notes."""
     panels = sorted({(int(a), int(b)) for a, b in zip(modes["L"].values, modes["M"].values, strict=True)})
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(5.2 * columns, 3.6 * rows + 0.4), layout="constrained")
-    figure.suptitle(title, fontsize=11, parse_math=False)
+    size = (5.2 * columns, 3.6 * rows + 0.4) if len(panels) > 1 else (6.6, 4.6)
+    figure = Figure(figsize=size, layout="constrained")
     paired = "biposh_difference_binned_mean" in modes
     for number, (L, M) in enumerate(panels):
         axes = figure.add_subplot(rows, columns, number + 1)
@@ -88,19 +97,32 @@ def _draw(modes: xr.Dataset, title: str, expected: xr.Dataset | None) -> Figure:
         if paired and M == 0:
             _frame(axes, modes.isel(mode=np.flatnonzero(inside)))
         axes.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
-        axes.set_title(f"L = {L}, M = {M}", fontsize=10)
+        if title is not None or len(panels) > 1:
+            axes.set_title(f"L = {L}, M = {M}", fontsize=10)
         quantity = rf"$\ell(\ell+1)\hat{{A}}^{{{L}{M}}}/2\pi$  [$\mu$K$^2$]"
         axes.set(xlabel=r"multipole $\ell = \ell_2$", ylabel=quantity)
-        axes.legend(fontsize=8, frameon=False)
+        axes.legend(handles=[*axes.get_legend_handles_labels()[0], *_styles(paired and M == 0, expected)], **_LEGEND)
+    if title is None:
+        return figure
+    figure.suptitle(title, fontsize=11, parse_math=False)
     notes = [r"$\hat{A}$: Bennett normalisation (odd parity: Hajian-Souradeep, rescaled alike)"]
     if paired:
-        notes += ["points: non-circular minus circular-beam control"]
-        notes += ["band (M = 0, may leave the panel): plain mean and its standard error"]
+        notes += ["points: non-circular minus circular-beam control; bands may leave the panel"]
     if expected is not None:
-        notes.append(f"dashed: prediction, {expected.attrs['prediction']}")
+        notes.append(f"prediction: {expected.attrs['prediction']}")
     # Some 15 letters of this size fill an inch: longer lines would be cut off at both ends.
     figure.supxlabel(textwrap.fill(";  ".join(notes), round(14 * figure.get_figwidth())), fontsize=9)
     return figure
+
+
+def _styles(band: bool, expected: xr.Dataset | None) -> list[Artist]:
+    """Return what the legend says of bands and lines, whatever their colour."""
+    found: list[Artist] = []
+    if band:
+        found.append(Patch(color="0.5", alpha=0.3, linewidth=0, label="plain mean ± its error"))
+    if expected is not None:
+        found.append(Line2D([], [], color="0.3", linestyle="--", linewidth=1.0, label="prediction"))
+    return found
 
 
 def _frame(axes: Axes, modes: xr.Dataset) -> None:

@@ -159,6 +159,14 @@ def test_a_picture_stays_whole_where_the_next_does_not_fit(name: str, tmp_path: 
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
+def test_a_figure_for_a_paper_has_no_title_and_no_notes(mcsim: Command, small_store: Path) -> None:
+    words = ("plot", str(small_store), "--L", "2", "--M", "0", "--d", "0", "-o")
+    assert mcsim(*words, "whole.svg")[0] == mcsim(*words, "bare.svg", "--no-caption")[0] == 0
+    whole, bare = (Path(name).read_text(encoding="utf-8") for name in ("whole.svg", "bare.svg"))
+    assert "realizations" in whole
+    assert "realizations" not in bare
+
+
 @pytest.mark.parametrize("chosen", [{}, {"L": 2, "M": 0}])
 def test_notes_of_a_wide_and_a_narrow_figure_are_whole(small_store: Path, chosen: dict[str, int]) -> None:
     figure = ensemble_figure(small_store, prediction=predict(table()), **chosen)
