@@ -36,8 +36,8 @@ def ensemble_figure(
 
     ``path``: store with a summary. ``L``, ``M``, ``d``: draw only these; by default one panel for every L > 0 and M (L
     = 0 if there is no other). ``pair``: label of the pair; by default the first. ``prediction``: prediction by
-    :func:`mcsim.predict`, drawn as dashed lines. ``caption``: with a title, and with notes below. Raise InputError if the selection is empty, or the prediction is in
-    another frame or lacks the pair or a mode.
+    :func:`mcsim.predict`, drawn as dashed lines. ``caption``: with a title, and with notes below. Raise InputError if
+    the selection is empty, or the prediction is in another frame or lacks the pair or a mode.
     """
     with opening.open_summary(path) as summary:
         pairs = [str(label) for label in summary["pair"].values]
