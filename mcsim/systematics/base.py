@@ -288,7 +288,7 @@ class Effect:
         >>> BeamEllipticity.format_amplitude(0.159, 0.008)
         'axis ratio 1.159 ± 0.008'
         """
-        how = cls.wording or Wording(symbol=f" ({cls.unit})")
+        how = cls.wording or Wording(text="{} " + f"({cls.unit})".replace("{", "{{").replace("}", "}}"))
         if amplitude < 0.0 and how.negative is not None:
             return how.negative.format(measured(-how.scale * amplitude + how.offset, how.scale * sigma, how.symbol))
         return how.text.format(measured(how.scale * amplitude + how.offset, how.scale * sigma, how.symbol))

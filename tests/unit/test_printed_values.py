@@ -52,6 +52,8 @@ def test_amplitudes_have_the_units_that_people_read():
     assert offset(amplitude=1.53, angle_deg=178.0).describe(0.041) == "1.53′ ± 0.04′ against the scan"
     assert offset(amplitude=1.53, angle_deg=-37.0).direction() == "at −37° to the scan"
     assert systematics.get("noise_level").format_amplitude(-0.095, 0.01) == "9.5 % ± 1.0 % less noise"
+    plain = type("Plain", (systematics.Effect,), {"name": "plain", "unit": "k of {k}", "__module__": __name__})
+    assert plain.format_amplitude(0.00122, 0.00005) == "0.00122 ± 0.00005 (k of {k})"
     assert ellipse.label("W1") == "beam ellipticity of W1"
 
 
