@@ -2,6 +2,8 @@
 
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -65,25 +67,39 @@ def _again(ctx: Any) -> str:
     return f"finished {_KEPT[command]} are kept, and mcsim {command} goes on with them when it is called again"
 
 
-def _refusal(error: BadParameter) -> InputError | None:
-    """Return a sentence on a value that an option cannot have; None for what is missing or unknown."""
-    found = getattr(error.__cause__, "errors", None)  # of pydantic, with which typer reads values
-    if found is None or error.param is None:
-        return None
-    first, option = found()[0], error.param.opts[0]
-    why = first["msg"][:1].lower() + first["msg"][1:]
-    return InputError(f"{option} {first['input']}: {why}; mcsim {_name(error.ctx)} -h says what it can be.")
+_UsageError: type[Any] = BadParameter.__mro__[1]  # where typer has it differs from version to version
+
+
+@contextmanager
+def _refusals(command: str) -> Iterator[None]:
+    """Say in a sentence what words a command does not take: they are bad input as any other."""
+    try:
+        yield
+    except _UsageError as error:
+        if type(error).__name__ == "NoArgsIsHelpError":  # no words at all: this shows the help
+            raise
+        help_ = f"{command} -h says what it takes."
+        found = getattr(error.__cause__, "errors", None)  # of pydantic, with which typer reads values
+        if found is None or error.param is None:
+            text = error.format_message().rstrip(".").replace(". Did you mean", "; did you mean")
+            raise InputError(f"{text[:1].lower()}{text[1:]}{' ' if text.endswith('?') else '; '}{help_}") from None
+        first = found()[0]
+        why = first["msg"][:1].lower() + first["msg"][1:]
+        raise InputError(f"{error.param.opts[0]} {first['input']}: {why}; {help_}") from None
+
+
+def _called(name: str | None, parent: Any) -> str:
+    """Return what to call for the help of a command of a group; ``parent`` None: of all."""
+    return " ".join(filter(None, ("mcsim", *(() if parent is None else (_name(parent), name)))))
 
 
 class Command(TyperCommand):
     """A command whose flags show no type in --help, and that ends in order when it is interrupted."""
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Read the words of the command; a value that an option cannot have is bad input as any other."""
-        try:
+        """Read the words of the command."""
+        with _refusals(_called(info_name, parent)):
             return super().make_context(info_name, args, parent, **extra)
-        except BadParameter as error:
-            raise _refusal(error) or error from None
 
     def get_params(self, ctx: Any) -> Any:
         """Return the parameters of the command."""
@@ -101,6 +117,16 @@ class Command(TyperCommand):
 
 class Group(TyperGroup):
     """A group of commands whose flags show no type in --help."""
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """Read the options before the command."""
+        with _refusals(_called(info_name, parent)):
+            return super().make_context(info_name, args, parent, **extra)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the command."""
+        with _refusals(_called(None, ctx)):
+            return super().resolve_command(ctx, args)
 
     def get_params(self, ctx: Any) -> Any:
         """Return the parameters of the group."""
