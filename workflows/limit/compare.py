@@ -41,11 +41,11 @@ def main() -> None:
     for candidate, limit in zip(known.candidates, limits.effects, strict=True):
         assert candidate.label == limit.label
         columns = list(candidate.columns)
-        t, error = model.templates[:, columns], known.bank.error[:, columns]
-        noise = np.sum(null.whitening**2 @ error**2)
-        size = null.hartlap_factor * (np.sum(null.whiten_templates(t) ** 2) - noise) / len(columns)
+        t, error, typical = model.templates[:, columns], known.bank.error[:, columns], candidate.typical
+        noise = np.sum(null.whitening**2 @ error**2 @ typical**2)
+        size = null.hartlap_factor * (np.sum((null.whiten_templates(t) @ typical) ** 2) - noise) / typical.shape[1]
         sigma = 1.0 / np.sqrt(size) if size > 0.0 else np.inf
-        found = detectable(null, t, len(known.candidates))
+        found = detectable(null, t, len(known.candidates), typical)
         ratios = f"{limit.sigma / sigma:.2f} | {limit.amplitude_90 / found:.2f}"
         print(f"| {limit.label} | {limit.sigma:.3g} | {100 * limit.error:.1f} % | {sigma:.3g} | {ratios} |")
 
