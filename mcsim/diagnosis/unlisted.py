@@ -12,13 +12,12 @@ from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.words import refuted
 from mcsim.reconstruction.fitted_nuisances import FittedNuisances
-from mcsim.reconstruction.plugin import Plugin, plugin
+from mcsim.reconstruction.plugin import plugin
 from mcsim.reconstruction.result import Reconstructed
 from mcsim.reconstruction.scores import Scene
 from mcsim.reconstruction.search import Search
 from mcsim.reconstruction.simulated_effects import Reconstruction
 from mcsim.reconstruction.simulated_scores import scene_for, scores_of_maps, search_of, with_peaks
-from mcsim.reconstruction.structure import Structure
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Vector
@@ -65,21 +64,20 @@ def structures_of(
     if not (found := search.run(x, made)):
         return (), None
     indices = [one.structure for one in found]
-    _, plugins, _ = made.fitted(indices)
-    return tuple(made.described(found)), reduction_of(data, made, [search.grammar[k] for k in indices], plugins)
+    return tuple(made.described(found)), reduction_of(data, made, indices)
 
 
-def reduction_of(
-    data: ObservedMaps, made: Reconstruction, chosen: Sequence[Structure], plugins: Sequence[Plugin | None]
-) -> HeldOut | None:
+def reduction_of(data: ObservedMaps, made: Reconstruction, chosen: Sequence[int]) -> HeldOut | None:
     """Return how far effects that are fitted to one half of the data reduce the excess of the other half.
 
-    A structure that is measured map by map is fitted to those of the first fold alone; of others, and of patterns
-    that act on few modes, the shape is that of all data. The amplitudes are those that fit the elements of the
-    first fold of the data vector, up to :data:`LARGEST` times that of the scores: what else these elements hold,
-    as a pattern's finer structure, would be put down to them, and powers grow faster than in proportion.
+    A structure that is measured map by map is fitted to those of the first fold alone, with the others taken out: in
+    one half structures look alike that do not in both. Of others, and of patterns that act on few modes, the shape is
+    that of all data. The amplitudes are those that fit the elements of the first fold of the data vector, up to
+    :data:`LARGEST` times that of the scores: what else these elements hold, as a pattern's finer structure, would be
+    put down to them, and powers grow faster than in proportion.
     """
-    acting = [(w, one) for w, one in zip(chosen, plugins, strict=True) if one is not None]
+    _, plugins, _ = made.fitted(chosen)
+    acting = [(made.search.grammar[k], one) for k, one in zip(chosen, plugins, strict=True) if one is not None]
     if plugins[0] is None:  # the others are what it leaves
         return None
     context, settings = data.context, data.context.settings
@@ -90,7 +88,8 @@ def reduction_of(
         if by_map and len(made.scene.splits) > 1:
             if not len((half := structure.within(0, folds)).weights):
                 return None
-            ((theta, _),) = made.search.fit([half], made.x)
+            own = made.x if len(chosen) == 1 else made.left(chosen) + made.made([effect])
+            ((theta, _),) = made.search.fit([half], own)
             effect = plugin(effect.name, structure, theta, made.scene) or effect
         first.append(effect)
     matrix, told = data.halves()

@@ -8,7 +8,7 @@ sky. Scores of variances and powers are such derivatives too.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import healpy
 import numpy as np
@@ -283,8 +283,9 @@ class Scene:
             found += list(self._orders(view, filtered.orders[i], i))
         for channel in range(len(self.channels)):
             if len(own := self.of(channel)) > 1:
-                a, b = filtered.adjoint[own[0]], filtered.adjoint[own[1]]
-                found += [self._powers(a - b, a - b), self._powers(a, b)]
+                pairs = list(combinations([filtered.adjoint[i] for i in own], 2))
+                apart = np.sum([self._powers(a - b, a - b) for a, b in pairs], axis=0)
+                found += [2.0 / len(own) * apart, np.sum([self._powers(a, b) for a, b in pairs], axis=0)]
         for scaling in self.scalings.values():
             each = ((i, f * filtered.adjoint[i]) for i, f in zip(self.shared, scaling, strict=True))
             total = np.sum([alm_.multiply(one, self.views[i].response, self.lmax) for i, one in each], axis=0)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mcsim.reconstruction.grammar import LOWEST
 from mcsim.reconstruction.scores import INDICES
-from mcsim.reconstruction.structure import ALIKE, MEANS, Structure
+from mcsim.reconstruction.structure import ALIKE, MEANS, OPPOSITE, Structure
 from mcsim.sphere import healpix, real
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector, divided
@@ -163,7 +163,8 @@ class Search:
             rival = next((k for k in near if less[k] < np.log(RIVAL) and not own.like(self.grammar[k])), None)
             near.sort(key=lambda k: k != rival)  # it is told first
             found.append(Found(members[best], p, float(falls[best]), tuple(near), rival))
-            if (own.stage, own.kind) == ("added", "power"):  # nobody knows what such a pattern leaves in other scores
+            # Nobody knows what such a pattern leaves in other scores; with more noise they scatter more.
+            if own.stage == "noise" or (own.stage, own.kind) == ("added", "power"):
                 break
             chosen = [one.structure for one in found]
             if sky is not None:
@@ -372,7 +373,7 @@ class Search:
             ((theta, _),) = self.fit([structure], scores)
             pattern = theta if structure.mix is None else structure.mix.T @ theta
             a = real.field(np.asarray(pattern), *healpix.centres(COARSE))
-        a = np.maximum(a, LARGEST_FALL)
+        a = np.maximum(np.abs(a) if structure.split == OPPOSITE else a, LARGEST_FALL)  # whichever split has more
         if not np.any(np.abs(a) > TINY):
             return 1.0
         return float(2.0 * np.sum(modes * (a - np.log1p(a))) / np.sum(modes * a**2))
@@ -381,7 +382,7 @@ class Search:
         """Return the sums of squares whose relative change powers are, from scores (..., P).
 
         What two splits of a channel have in common is a b = |(a + b)/2|^2 - |(a - b)/2|^2, below zero on average where
-        the filter has taken the sky out of their sum; more of it is in the first part alone.
+        the filter has taken the sky out of their sum; more of it is in the first part alone. So it is of n, over pairs.
         """
         found = structure.of(scores)
         if structure.stage != "added" or structure.channel is None:

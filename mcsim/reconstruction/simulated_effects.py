@@ -174,7 +174,7 @@ class Reconstruction:
         tried = self._trial[member]
         self._kept[member] = amplitudes @ tried.coordinates, amplitudes @ tried.made
 
-    def left(self, chosen: list[int]) -> Vector:
+    def left(self, chosen: Sequence[int]) -> Vector:
         """Return the scores without what the effects of structures make of them on this sky."""
         _, plugins, rest = self.fitted(chosen)
         return self.x - sum(self._kept[k][1] for k in chosen) if None in plugins else rest
@@ -201,9 +201,9 @@ class Reconstruction:
             size, where, picture = (None, "", np.zeros(0)) if effect is None else self.picture(structure, effect)
             if structure.of_a_foreground:
                 size = rms_of_powers(structure, theta, self.scene)
-            says = words.says(structure, theta, self.scene)
+            says = words.says(structure, theta, covariance, self.scene)
             others = [self.search.grammar[k] for k in one.alternatives[:ALTERNATIVES]]
-            told = tuple(words.says(other, self.search.fit([other], self.x)[0][0], self.scene) for other in others)
+            told = tuple(words.says(other, *self.search.fit([other], self.x)[0], self.scene) for other in others)
             rival = None if one.rival is None else dict(zip(WORDS, (*others[0].says, told[0]), strict=True))
             yield Reconstructed(
                 *structure.says,

@@ -47,11 +47,20 @@ def cause(structure: Structure, library: Library) -> str:
     return f"{kind_.label()}: {kind_.cause.rstrip('.')}{source}{tried}"
 
 
-def says(structure: Structure, theta: Vector, scene: Scene) -> str:
-    """Return what a structure is and where, as the beginning of a sentence."""
-    return ", ".join(
-        filter(None, (_what(structure, theta), _degrees(structure, theta, scene), *_where(structure, scene)))
-    )
+def says(structure: Structure, theta: Vector, covariance: Matrix, scene: Scene) -> str:
+    """Return what a structure with these coordinates is and where, as the beginning of a sentence."""
+    spans = profile_ranges(structure, scene)
+    free = spans is not None and structure.mix is None and not structure.kind.endswith("low l")
+    count = len(spans) if spans is not None and free else 1
+    most = _most(theta, covariance, count)
+    own = theta.reshape(count, -1)[most] if structure.stage == "beam" else theta
+    return ", ".join(filter(None, (_what(structure, own), _degrees(structure, spans, most), *_where(structure, scene))))
+
+
+def _most(theta: Vector, covariance: Matrix, count: int) -> int:
+    """Return which range of a profile the data show best: sizes are of powers of l, and noise at low l."""
+    each = np.arange(theta.size).reshape(count, -1)
+    return int(np.argmax([theta[rows] @ np.linalg.pinv(covariance[np.ix_(rows, rows)]) @ theta[rows] for rows in each]))
 
 
 def _what(structure: Structure, theta: Vector) -> str:
@@ -68,7 +77,7 @@ def _what(structure: Structure, theta: Vector) -> str:
         case "added", "sky":
             return f"is added to the signal, fixed to the sky ({_pattern(kind)})"
         case "added", "spacecraft" if kind == "lobe":
-            return f"is the dipole as a lobe fixed to the spacecraft sees it, {_lobe(theta)}"
+            return f"is the dipole as a lobe fixed to the spacecraft sees it, {_lobe(structure, theta)}"
         case "added", "spacecraft" if kind == "Galaxy":
             return "is added to the signal as the Galaxy is in a lobe fixed to the spacecraft"
         case "added", "spacecraft" if kind.startswith("degrees"):
@@ -123,7 +132,7 @@ def _order(order: int, theta: Vector) -> str:
     if order == 0:
         return "follows the sky, as a change of the round part of the beam does"
     # b_lm of a beam turned by a has the phase e^(-i m a); a displacement along x has b_l1 < 0, a stretch b_l2 > 0.
-    total = complex(np.sum(theta.reshape(-1, 2) @ [1.0, 1j])) * (-1) ** order
+    total = complex(*theta) * (-1) ** order
     angle = -np.rad2deg(np.angle(total)) / order
     return f"follows {_derivative(order)} {scan_direction(angle, 360.0 / order)}"
 
@@ -189,26 +198,26 @@ SUN = {
 """What a signal or a gain depends on in the frame of the Sun."""
 
 
-def _lobe(theta: Vector) -> str:
+def _lobe(structure: Structure, theta: Vector) -> str:
     """Return where a lobe points that sees the dipole like this, as a sentence goes on."""
-    x, y, z = (float(one) for one in theta)
+    x, y, z = map(float, theta if structure.mix is None else structure.mix.T @ theta)
+    towards = scan_direction(np.rad2deg(np.arctan2(y, x)))
+    if structure.mix is not None:  # the dipole along the line of sight was subtracted from the maps
+        return f"away from the line of sight, {towards}"
     away = np.rad2deg(np.arctan2(np.hypot(x, y), z))
-    return f"{away:.0f}° from the line of sight" + (
-        f", {scan_direction(np.rad2deg(np.arctan2(y, x)))}" if 5.0 < away < 175.0 else ""
-    )
+    return f"{away:.0f}° from the line of sight" + (f", {towards}" if 5.0 < away < 175.0 else "")
 
 
-def _degrees(structure: Structure, theta: Vector, scene: Scene) -> str:
+def _degrees(structure: Structure, spans: list[tuple[int, int]] | None, most: int) -> str:
     """Return the degrees with most of a profile, for a profile."""
-    if (spans := profile_ranges(structure, scene)) is None:
+    if spans is None:
         return ""
     if structure.kind.endswith("low l"):
         low = (structure.mix[0] > 0).sum() if structure.mix is not None else 1
         return f"as a halo about the beam does, up to ℓ {spans[low - 1][1]}"
     if structure.mix is not None:
         return f"growing as ℓ{SUPERSCRIPT[structure.kind[-1]]}"
-    sizes = np.abs(theta.reshape(len(spans), -1)).sum(axis=1)
-    low, high = spans[int(np.argmax(sizes))]
+    low, high = spans[most]
     return f"most at ℓ {low}–{high}" if high > low else f"most at ℓ {low}"
 
 

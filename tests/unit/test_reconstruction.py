@@ -417,7 +417,7 @@ def test_the_direction_of_a_beam_is_said(name, parameters, order, expected):
     edges = seen()[1].edges(order)
     v = np.array([np.mean(change[low:high] / kernel[low:high]) for low, high in pairwise(edges)])
     theta = np.stack([v.real, v.imag], axis=1).ravel()
-    assert expected in words.says(structure, theta, seen()[1])
+    assert expected in words.says(structure, theta, np.eye(theta.size), seen()[1])
 
 
 def test_the_sun_in_a_lobe_is_a_von_mises_function():
@@ -471,7 +471,7 @@ def test_every_structure_has_words_and_a_picture():
     scene = seen()[1]
     for structure in grammar():
         theta = np.linspace(0.5, 1.0, structure.size)
-        text = words.says(structure, theta, scene)
+        text = words.says(structure, theta, np.eye(structure.size), scene)
         assert text
         assert (structure.channel or "") in text
         profile = words.profile(structure, theta, np.eye(structure.size), scene)

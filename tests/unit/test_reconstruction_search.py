@@ -12,7 +12,7 @@ from mcsim.reconstruction.grammar import LOWEST
 from mcsim.reconstruction.plugin import CONSTANT
 from mcsim.reconstruction.search import ALTERNATIVES, LEVEL, MOST, RARE, Response, Search, evidence
 from mcsim.reconstruction.simulated_effects import Reconstruction
-from mcsim.reconstruction.structure import ALIKE, ANY, OFFSET, Structure
+from mcsim.reconstruction.structure import ALIKE, ANY, OFFSET, OPPOSITE, Structure
 
 
 def plain(stage, rows):
@@ -251,6 +251,29 @@ def test_large_variances_are_judged_by_their_likelihood(stage, kind, unit):
     assert fall == pytest.approx(9.0, rel=0.2)
 
 
+@pytest.mark.parametrize("more", [1.0, 3.0])
+def test_noise_of_one_split_is_judged_alike_in_whichever_it_is(more):
+    """More noise of the second split has a negative coordinate where splits are opposite: no less of it."""
+    scores_ = np.random.default_rng(2).normal(size=(400, 1))
+    place = np.array([[0]])
+    search = Search(
+        (Structure("noise", "", "", "level", "W1", OPPOSITE, None, place, np.ones(1), None, (0,)),), scores_
+    )
+    mean, size = scores_.mean(axis=0), more / CONSTANT
+    first, second = (search._falls(mean + sign * size * scores_.var(axis=0)) for sign in (1.0, -1.0))
+    assert second == pytest.approx(first)
+    assert first < search.nulls[0].hartlap_factor * search.nulls[0].chi2(mean + size * scores_.var(axis=0))
+
+
+@pytest.mark.parametrize(("stage", "first", "count"), [("noise", 60.0, 1), ("other", 12.0, 2)])
+def test_what_is_beside_more_noise_is_not_looked_for(stage, first, count):
+    """Scores scatter more in noise that the simulations do not have."""
+    simulations = np.random.default_rng(1).normal(size=(400, 2))
+    level = replace(plain(stage, [0]), kind="level")
+    found = Search((level, plain("added", [1])), simulations).run(np.array([first, 11.0]))
+    assert [one.structure for one in found] == [0, 1][:count]
+
+
 def test_power_of_one_channel_is_judged_by_that_of_the_sum_of_its_splits():
     """Their products are below zero on average, where the sky is taken out of their sum: more power is more of it."""
     n, a, left = 500, 10.0, 0.3
@@ -311,10 +334,11 @@ def test_a_structure_is_fitted_to_all_maps_of_the_first_fold(monkeypatch):
     )
     monkeypatch.setattr(unlisted, "plugin", lambda *_: None)
     monkeypatch.setattr(unlisted.Halves, "of", lambda *_: None)
-    search = SimpleNamespace(fit=lambda chosen, x: fitted.extend(chosen) or [(np.ones(1), np.eye(1))])
+    search = SimpleNamespace(fit=lambda chosen, x: fitted.extend(chosen) or [(np.ones(1), np.eye(1))], grammar=(found,))
     context = SimpleNamespace(settings=None, ensemble=SimpleNamespace(remix=lambda matrix: None))
     data = SimpleNamespace(context=context, halves=lambda: (np.eye(1), "halves"), x=np.zeros(1))
     scene = SimpleNamespace(views=split, splits=("a", "b", "c"))
     made = Reconstruction(None, scene, search, np.zeros(3), None)
-    assert unlisted.reduction_of(data, made, [found], [SimpleNamespace(name="unlisted_1")]) is None
+    made._fitted[0,] = [], [SimpleNamespace(name="unlisted_1")], np.zeros(3)
+    assert unlisted.reduction_of(data, made, [0]) is None
     assert [one.views for one in fitted] == [(0, 2)]

@@ -35,7 +35,7 @@ def test_what_frequencies_share_is_in_all_maps_but_those_of_a_component_separati
         told = (what, None, ALIKE, index)
         (found,) = (one for one in structures(scene) if one.says[3:] == told)
         assert found.views == (0, 1, 2, 3)
-        assert says in words.says(found, np.ones(found.size), scene)
+        assert says in words.says(found, np.ones(found.size), np.eye(found.size), scene)
         kind = plugin("unlisted_1", found, np.ones(found.size), scene).kind()
         effect = config.Effect(name="unlisted_1", parameters={"amplitude": 1.0})
         acting = survey(replace(run, effects=(effect,)), library={"unlisted_1": kind})
@@ -78,3 +78,53 @@ def test_scores_of_what_grows_with_the_frequency(stage, frame, kind, split, inde
     scale = np.sqrt(sum(r @ r * (one @ one) for r, one in products) / added[0].size)
     tolerance = 0.05 if stage == "added" else 0.1  # of products with a sky that samples see beside pixels' centres
     assert abs(sum(r @ one for r, one in products) - theta @ structure.of(u)) < tolerance * scale
+
+
+def test_powers_of_splits_do_not_depend_on_their_order():
+    """Of three splits, what differs between any two of them, and what any two have in common."""
+    table = two_channels("thirds", **SMALL)
+    table["map"]["splits"] = ["a", "b", "c"]
+    run = config.load(table)
+    model = model_of(survey(run, orders=2), DiagnosisSettings())
+    scene = simulated_scores.scene_of(model)
+    found = wiener_filter(model, list(simulate.maps(model.survey, 3)))
+    rows = [k for k, key in enumerate(scene.keys) if key[:2] in (("difference", 1), ("common", 1))]
+    own, moved = scene.of(1), np.arange(len(scene.views))
+    moved[list(own)] = np.roll(own, 1)
+    turned = replace(found, adjoint=found.adjoint[moved])
+    np.testing.assert_allclose(scene.listed_values(turned)[rows], scene.listed_values(found)[rows], rtol=1e-9)
+    half = len(rows) // 2
+    apart, common = scene.listed_values(found)[rows[:half]], scene.listed_values(found)[rows[half:]]
+    total = np.sum(found.adjoint[list(own)], axis=0)
+    np.testing.assert_allclose(common + 0.25 * apart, scene._powers(total, total) / 3.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("order", "angle", "at"), [(1, 90.0, "across the scan (+90°)"), (2, 30.0, "at 30° to the scan")]
+)
+def test_the_direction_of_a_beam_is_that_of_the_degrees_that_show_it(order, angle, at):
+    """Coordinates are sizes of powers of l, and those of the lowest degrees mostly noise."""
+    scene = simulated_scores.scene_of(
+        model_of(survey(config.load(two_channels("low", **SMALL)), orders=4), DiagnosisSettings())
+    )
+    structure = next(w for w in structures(scene) if w.says[:5] == ("beam", "sky", "scan", f"order {order}", "W1"))
+    errors = np.repeat([1.0, *np.full(structure.size // 2 - 1, 0.02)], 2)
+    theta = 1.5 * errors * np.array([1.0, -1.0] * (structure.size // 2))
+    phase = (-1) ** order * 0.3 * np.exp(-1j * order * np.deg2rad(angle))
+    theta[-2:] = phase.real, phase.imag
+    said = words.says(structure, theta, np.diag(errors**2), scene)
+    low, high = words.profile_ranges(structure, scene)[-1]
+    assert at in said
+    assert f"ℓ {low}–{high}" in said
+
+
+def test_a_lobe_in_maps_without_a_dipole_has_a_direction_about_the_line_of_sight_alone():
+    scene = simulated_scores.scene_of(
+        model_of(survey(config.load(two_channels("lobe", **SMALL)), orders=2), DiagnosisSettings())
+    )
+    lobe = next(w for w in structures(scene) if w.kind == "lobe" and w.channel == "W1")
+    kept = replace(lobe, mix=np.eye(3)[:2])
+    assert "90° from the line of sight" in words.says(lobe, np.array([0.0, 1.0, 0.0]), np.eye(3), scene)
+    said = words.says(kept, np.array([0.0, 1.0]), np.eye(2), scene)
+    assert "across the scan (+90°)" in said
+    assert "90° from" not in said
