@@ -44,7 +44,9 @@ Noise = tuple[float, ...]  #: factors of the variance of the noise of channels; 
 
 Turned = str  #: run (JSON) whose effects turn the sky that all channels see into another; "": they do little
 
-Seen = tuple[Factors, Noise, Orders, Added, Turned]
+Gains = tuple[float, ...]  #: of each map, beside those of its channel; (): all is close to 1
+
+Seen = tuple[Factors, Noise, Orders, Added, Turned, Gains]
 """How channels see a sky otherwise, what maps show besides, and what was done to the sky itself."""
 
 Skies = Literal["reference", "typical", "constrained"]
@@ -79,14 +81,15 @@ class SameSkies:
 
         Notes
         -----
-        A gain 1 + g of one channel is in the filtered sky with a weight w: its response there is 1 + w g times the true
-        one, and a fit gives g/(1 + w g). So it is with each degree that a beam loses. Gains up to SMALL and beams up to
-        BENT, the steps of linear responses among them, stay. What orders m > 0 of a beam add to a map is another map of
-        the sky, which is in the filtered one with a weight, too: it is computed from the sky that is found, and taken
-        from the maps, until that sky changes no more. Other noise changes the weights. What effects show without a sky,
-        a foreground or a residual dipole behind a mask, is simulated and taken from the maps first. Where a sky has a
-        part of it already, the effect adds more than it did to the data, and the fit too little. A modulation of the
-        sky itself is undone in what was filtered: a fit would be too small by the square of its amplitude.
+        A gain 1 + g of one channel, or of one map, is in the filtered sky with a weight w: its response there is 1 + w
+        g times the true one, and a fit gives g/(1 + w g). So it is with each degree that a beam loses. Gains up to
+        SMALL and beams up to BENT, the steps of linear responses among them, stay. What orders m > 0 of a beam add to a
+        map is another map of the sky, which is in the filtered one with a weight, too: it is computed from the sky that
+        is found, and taken from the maps, until that sky changes no more. Other noise changes the weights. What effects
+        show without a sky, a foreground or a residual dipole behind a mask, is simulated and taken from the maps first.
+        Where a sky has a part of it already, the effect adds more than it did to the data, and the fit too little. A
+        modulation of the sky itself is undone in what was filtered: a fit would be too small by the square of its
+        amplitude.
         """
         return self._skies(self.seen(found))
 
@@ -100,8 +103,8 @@ class SameSkies:
 
     def _sky(self, seen: Seen) -> Alm:
         """Return the filtered sky of the maps if channels see it otherwise."""
-        factors, noise, orders, added, turned = seen
-        maps = self._added.less(self.maps, added)
+        factors, noise, orders, added, turned, gains = seen
+        maps: Sequence[Map] = _divided(self._added.less(self.maps, added), gains)
         found = before = self._through(factors, noise, maps)
         changed = np.inf
         for _ in range(ROUNDS if orders else 0):
@@ -131,9 +134,7 @@ class SameSkies:
     def _through(self, factors: Factors, noise: Noise, maps: Sequence[Map]) -> Alm:
         """Return the filtered sky of maps whose degrees channels see otherwise, with other noise."""
         model, (gains, _) = self._model(factors, noise), self._split(factors)
-        pairs = zip(maps, gains[[part.channel for part in model.parts]], strict=True)
-        given = [map_ if g == 1.0 else np.where(map_ == healpy.UNSEEN, map_, map_ / g) for map_, g in pairs]
-        return shared_sky(model, given)
+        return shared_sky(model, _divided(maps, [float(gains[part.channel]) for part in model.parts]))
 
     @cached_property
     def _model(self) -> Callable[[Factors, Noise], Model]:
@@ -182,7 +183,17 @@ class SameSkies:
             self.orders(found),
             self._added.run_of(found),
             self.turned(found),
+            self.gains(found),
         )
+
+    def gains(self, found: Sequence[config.Effect]) -> Gains:
+        """Return the gains that effects give to single maps; () if all are close to 1."""
+        model, row = self.analysis.model, []
+        acting = [self._acting(channel, found) for channel in model.survey.channels] if found else []
+        for part in model.parts if found else ():
+            site = replace(model.survey.channels[part.channel].site, split=part.split)
+            row.append(1.0 + systematics.shared_gain(acting[part.channel], site))
+        return tuple(row) if any(abs(one - 1.0) > SMALL for one in row) else ()
 
     def turned(self, found: Sequence[config.Effect]) -> Turned:
         """Return the run with those effects that turn the sky of all channels into another; "" if they do little."""
@@ -301,7 +312,7 @@ class SameSkies:
         noise = without_repeats(self.noise, found)
         there = [*noise, *found]
         jobs = [replace(job, negative=negative) for job in self._jobs(there, constrained, skies, there=there)]
-        source, seen = jobs[0].source, self.seen(there) if constrained else ((), (), (), "", "")
+        source, seen = jobs[0].source, self.seen(there) if constrained else ((), (), (), "", "", ())
         before = self._before[constrained, source is not None, bool(noise), negative, seen]
         if (first := len(before)) < skies:
             same = self._jobs(noise, constrained, skies, first, there)
@@ -339,6 +350,12 @@ class SameSkies:
         missing = [job for job in jobs if known[_key(job)] is None]
         known.update(zip(map(_key, missing), self.ask(missing) if missing else [], strict=True))
         return np.concatenate([rows for rows in known.values() if rows is not None])
+
+
+def _divided(maps: Sequence[Map], gains: Sequence[float]) -> list[Map]:
+    """Return maps, each over its gain; no gains: as they are."""
+    pairs = zip(maps, gains or [1.0] * len(maps), strict=True)
+    return [map_ if g == 1.0 else np.where(map_ == healpy.UNSEEN, map_, map_ / g) for map_, g in pairs]
 
 
 def makes_means(effect: systematics.Effect, site: systematics.Site) -> bool:

@@ -85,7 +85,7 @@ class DiagnosisSettings:
     compared_sets
         Sets of effects that are simulated for it, the most probable ones.
     slice_snr
-        Expected S/N of an effect in a part of the data from which on the part counts.
+        Expected S/N of an effect in a part of the data from which on the part counts; half of it for one on noise.
     place_pvalue
         P-value up to which a group of numbers is listed before others of a kind listed already.
     sims_per_element, pilot_sims_per_element

@@ -340,13 +340,14 @@ class Slices:
             return None
         x, responses = self.z[rows], np.column_stack([action.response for action in actions])
         t, count = np.column_stack([responses[rows], directions[rows]]), responses.shape[1]
-        forecast = null.expected_snr(t[:, :count].sum(axis=1)) ** 2
         found = null.fit(x, t)
+        fitted = null.dimension - found.dimension  # which takes as much of chi^2 from chance
+        forecast = null.expected_snr(t[:, :count].sum(axis=1)) ** 2 + fitted
         tolerated = self._tolerated(null, *(t * found.amplitudes)[:, :count].T)
         pairs = [action.pair for action in actions if action.pair is not None]
         each = [scatter_chi2(null, t, before[:, rows], after[:, rows]) for before, after in pairs]
         added, spread = (sum(one) for one in zip((tolerated, 0.0), *each, strict=True))
-        p = float(null.residual_test(found.chi2, null.dimension - found.dimension, added, spread))
+        p = float(null.residual_test(found.chi2, fitted, added, spread))
         scale = null.hartlap_factor
         return MapCheck(tuple(maps), scale * null.chi2(x), scale * found.chi2, forecast, found.dimension, p)
 

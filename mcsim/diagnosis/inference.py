@@ -44,18 +44,17 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     t = data.templates()
     start = bent_templates(context.null, data.x, t, context.bank.curvature, context.candidates)
     refined = Refiner(data).run(t, context.candidates, start=start)
+    plain = data, refined
     data, refined = with_found_noise(data, refined)
     found, reduction = refined.attribution.if_named(data.context.settings), None
     # An order of the maps in which the model fits says more than any effects, but for a single one.
     exchanged = [] if found.explanations and len(found.explanations[0].members) == 1 else data.exchanged
-    notes, refusals = [*in_words(data.context), *data.notes()], list[str]()
+    refusals = list[str]()
     if not exchanged:
-        if found.explanations:
-            found, refusals = agreeing(data, refined, found)
-        if (beside := with_rivals(data, refined, found)) is not None:
-            again, refused = agreeing(*beside, beside[1].attribution.if_named(data.context.settings))
-            if again.explanations or found.explanations:
-                (data, refined), found, refusals = beside, again, refused
+        data, refined, found, refusals = _compared(data, refined)
+        if data.context.noise and found.explanations and not _has_noise(refined, found):
+            data, refined, found, refusals = _compared(*plain)  # noise that is not there hides what is left
+    notes = [*in_words(data.context), *data.notes()]
     context, detected = data.context, refined.partial
     if exchanged:
         found, detected = found.unexplained(), None
@@ -74,6 +73,24 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
         notes += as_seen(context, own.members, own.fit)
     refined = replace(refined, attribution=found, partial=detected)
     return replace(result_of(data, case, refined, reduction, notes), orders=tuple(exchanged))
+
+
+def _compared(data: DataSet[Any], refined: Refined) -> tuple[DataSet[Any], Refined, Attribution, list[str]]:
+    """Return data and attribution with rivals that take part, what parts of the data bear out of it, and refusals."""
+    found, refusals = refined.attribution.if_named(data.context.settings), list[str]()
+    if found.explanations:
+        found, refusals = agreeing(data, refined, found)
+    if (beside := with_rivals(data, refined, found)) is not None:
+        again, refused = agreeing(*beside, beside[1].attribution.if_named(data.context.settings))
+        if again.explanations or found.explanations:
+            return *beside, again, refused
+    return data, refined, found, refusals
+
+
+def _has_noise(refined: Refined, found: Attribution) -> bool:
+    """Return True if an effect on noise alone is in one of the sets."""
+    members = {member for one in found.explanations for member in one.members}
+    return any(refined.candidates[member].parametrization.noise_alone for member in members)
 
 
 def _is_out_of_order(data: DataSet[Any], first: Refined) -> bool:

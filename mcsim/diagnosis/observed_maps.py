@@ -150,17 +150,20 @@ class ObservedMaps(DataSet[Sequence[Map]]):
 
     @cached_property
     def exchanged(self) -> list[str]:
-        """Return sentences on orders of maps or pixels in which the model fits, if it does not as they are."""
-        context, level = self.context, self.context.settings.exchanged_pvalue
-        if self.gap.omnibus > level:
+        """Return sentences on orders of maps or pixels in which the model fits, if it hardly does as they are."""
+        context, settings, level = self.context, self.context.settings, self.context.settings.exchanged_pvalue
+        if self.gap.omnibus > level or self.gap.pvalue > settings.alpha:
             return []
-        parts, notes = context.analysis.model.parts, []
+        parts, null, notes = context.analysis.model.parts, context.of_model.null, []
+        # Maps that are alike have nearly the same chi^2 in any order.
+        needed = float(null.log_likelihood(self.gap.chi2)) + np.log(settings.odds_cut)
 
         def pvalue(maps: Sequence[Map]) -> float:
             # What is left out is filled, and departs from no model.
-            if max(map(share_left_out, parts, maps)) > context.settings.missing_share:
+            if max(map(share_left_out, parts, maps)) > settings.missing_share:
                 return 0.0
-            return context.of_model.null.pvalue(context.analysis.data_vector(maps))
+            chi2 = null.chi2(context.analysis.data_vector(maps))
+            return float(null.residual_test(chi2)) if null.log_likelihood(chi2) > needed else 0.0
 
         if (p := pvalue([healpy.reorder(one, n2r=True) for one in self.data])) > level:
             notes.append(f"The model fits (p = {p:.2g}) with maps read in the order NESTED; say so in their headers.")

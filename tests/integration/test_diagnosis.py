@@ -415,6 +415,12 @@ def test_maps_of_another_order_are_noticed(small):
     assert found.orders[0] in words.sentence(found)
     assert "V1:half1 as V1:half2" in notes([maps[i] for i in (1, 0, 3, 2)])
     assert "NESTED" not in notes(maps)
+    # Maps that are alike fit in any order, and where nothing departs none is said.
+    for changed in ({"alpha": 1e-300}, {"odds_cut": 1e300}):
+        model = replace(small.analysis.model, settings=replace(small.settings, **changed))
+        known = replace(small, analysis=replace(small.analysis, model=model))
+        other = ObservedMaps(known, [maps[i] for i in (1, 0, 3, 2)], ask)
+        assert other.exchanged == []
     # What is left out is filled, and departs from no model.
     seen = [np.where(np.arange(one.size) % 20 == k, healpy.UNSEEN, one) for k, one in enumerate(maps)]
     assert notes([seen[i] for i in (1, 0, 3, 2)]) == ""

@@ -1,5 +1,6 @@
 """What is simulated ahead is asked for once; observed skies are seen through the effect that is fitted."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -32,7 +33,7 @@ def test_effects_are_asked_for_at_once_and_then_known(monkeypatch: pytest.Monkey
     asked: list[list[str]] = []
     monkeypatch.setattr(SameSkies, "_jobs", jobs)
     monkeypatch.setattr(SameSkies, "skies_of", lambda *_: "constrained")
-    monkeypatch.setattr(SameSkies, "seen", lambda *_: ((), (), (), "", ""))
+    monkeypatch.setattr(SameSkies, "seen", lambda *_: ((), (), (), "", "", ()))
     monkeypatch.setattr("mcsim.datavector.same_skies.replace", lambda job, **_: job)
     skies = SameSkies(None, ask, ())  # type: ignore[arg-type]
     effects = [config.Effect(name=name) for name in ("a", "bb")]
@@ -70,6 +71,24 @@ def test_the_sky_of_maps_with_a_gain_is_found_without_it() -> None:
         np.testing.assert_array_equal(skies.observed_with([wider]), skies.observed)
         small = [config.Effect(name="calibration", channel="V1", parameters={"amplitude": 1e-3})]
         np.testing.assert_array_equal(skies.observed_with(small), skies.observed)
+
+
+@pytest.mark.parametrize("amplitude", [0.3, -0.3])
+def test_the_sky_of_maps_of_which_one_has_a_gain_is_found_without_it(amplitude: float) -> None:
+    """A sky with a weight w of the map would have 1 + w g of that in it, and a fit give g/(1 + w g)."""
+    run = config.load(two_channels("one split", sigma0_uk=1.0))
+    analysis = analysis_of(run, without=tuple(name for name in systematics.catalogue() if name != "beam_width"))
+    plain = SameSkies(analysis, lambda _: [], list(simulate.maps(survey(run), 0))).observed
+    split = run.map.splits[1]
+    library = (*analysis.library, ("split_calibration", systematics.get("split_calibration")))
+    gain = config.Effect(name="split_calibration", channel="W1", parameters={"amplitude": amplitude, "split": split})
+    maps = list(simulate.maps(survey(with_effects(run, [gain])), 0))
+    skies = SameSkies(replace(analysis, library=library), lambda _: [], maps)
+    without, off = (
+        np.linalg.norm(one - plain) / np.linalg.norm(plain) for one in (skies.observed_with([gain]), skies.observed)
+    )
+    assert off > 0.05
+    assert without < 0.2 * off
 
 
 @pytest.mark.parametrize("frame", ["ecliptic", "galactic"])
