@@ -60,7 +60,9 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
         found, detected = found.unexplained(), None
     elif found.explanations:
         found = _with_errors(data, refined, found)
-        found, reduction = confirmed(context, found, reduction_of(data, replace(refined, attribution=found)), notes)
+        found, reduction = confirmed(
+            context, found, reduction_of(data, replace(refined, attribution=found)), notes, refusals
+        )
         if why := unconfirmed(context, found, reduction is not None):
             refusals.append(why)
             found, reduction = found.unexplained(), None
@@ -101,19 +103,19 @@ def _is_out_of_order(data: DataSet[Any], first: Refined) -> bool:
 
 
 def confirmed(
-    context: DiagnosisContext, found: Attribution, reduction: HeldOut | None, notes: list[str]
+    context: DiagnosisContext, found: Attribution, reduction: HeldOut | None, notes: list[str], refusals: list[str]
 ) -> tuple[Attribution, HeldOut | None]:
     """Return attribution and reduction if they hold once the best set is simulated.
 
     A set that increases the excess chi^2 of the held-out data, reduces it by less than half of the prediction, or
     leaves most of it where what remains is significant, all beyond error, is not named. Held-out data without excess
-    beyond its own error measure no reduction. ``notes`` gets a sentence on either.
+    beyond its own error measure no reduction. ``refusals`` or ``notes`` get a sentence on either.
     """
     if reduction is None:
         return found, None
     if reduction.refutes(context.settings.reduction_sigma, context.settings.unexplained_pvalue):
         best = " and ".join(context.candidates[member].title for member in found.explanations[0].members)
-        notes.append(f"The best fit, {best}, is not named: {refuted(reduction)}.")
+        refusals.append(f"The best fit, {best}, is not named: {refuted(reduction)}.")
         return found.unexplained(), None
     if reduction.before.value < reduction.before.sigma:
         own = measured(reduction.before.value, reduction.before.sigma)

@@ -361,7 +361,7 @@ def judged(bench: Bench, shrink: HeldOut) -> tuple[str, HeldOut | None, list[str
     assert found.verdict == "effect"
     notes: list[str] = []
     context = SimpleNamespace(candidates=bench.candidates, settings=DiagnosisSettings())
-    after, kept = confirmed(context, found, shrink, notes)
+    after, kept = confirmed(context, found, shrink, notes, notes)
     return after.verdict, kept, notes
 
 
