@@ -34,7 +34,7 @@ RANGE = 1e7
 """Largest power of the sky over the white part of noise: beyond, conjugate gradients converge late, and what a step has
 smeared across a mask's edge counts. With more white noise the faintest degrees tell a little less than they could."""
 
-LITTLE = 1e-6  #: part of the noise that is no more than rounding
+LITTLE = 1e-6  #: part of the noise, or of a dipole, that is no more than rounding
 
 TAIL = 1e-3  #: part of the squared S/N of a change of a beam that is left beyond the last degree of its order
 EARLIEST = 16  #: degree at which orders may end: bins have degrees
@@ -187,7 +187,7 @@ class Model:
 
 
 def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
-    """Prepare a survey for the filter; raise InputError unless it has power of the sky, and pixels.
+    """Prepare a survey for the filter; raise InputError unless it has power of the sky, pixels, and one dipole.
 
     Of a channel that reads differences of two beams, the filter knows the mean of both sides.
     """
@@ -196,6 +196,13 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     run = survey.config
     if run.map.grid == "gl":
         raise InputError('a diagnosis compares maps of pixels; give the model map.grid = "healpix" and map.nside.')
+    dipoles = {one.site.channel: float(np.linalg.norm(one.site.dipole_uk)) for one in survey.channels}
+    if max(dipoles.values()) > min(dipoles.values()) * (1.0 + LITTLE):
+        least, most = (choose(dipoles, key=dipoles.__getitem__) for choose in (min, max))
+        raise InputError(
+            f"the scan of channel {most} is described with a dipole of {dipoles[most]:g} uK, and that of {least} with "
+            f"{dipoles[least]:g} uK; give the one that all channels see as sky.dipole_uk."
+        )
     both = zip(survey.channels, survey.making.channels, strict=True)
     response = np.stack([_circular(channel, made) for channel, made in both])
     parts, colours = [], np.ones_like(response)

@@ -41,6 +41,17 @@ def test_a_mean_is_weighted_with_the_inverse_variance_of_its_own_map_alone(analy
     np.testing.assert_allclose(found, [0.0, expected, 0.0, 0.0], rtol=1e-5, atol=1e-5 * expected)
 
 
+def test_channels_whose_descriptions_have_other_dipoles_are_refused(analysis) -> None:
+    """The dipole of the first channel stood for all: without one a gain of the other's had no name."""
+    known = analysis.model.survey
+    first, second = known.channels
+    none = replace(first, site=replace(first.site, dipole_uk=np.zeros(3)))
+    size = f"{np.linalg.norm(second.site.dipole_uk):g}"
+    for channels in ((none, second), (second, none)):
+        with refused("V1", "W1", size, "sky.dipole_uk"):
+            model_of(replace(known, channels=channels), DiagnosisSettings())
+
+
 def test_no_element_names_degrees_that_the_filters_do_not_have(analysis) -> None:
     """The Galactic plane was one of degrees 2 to 64 in a model that ends at 40."""
     elements = (*analysis.elements, *analysis.slices, *analysis.bipolar_scan.elements)
