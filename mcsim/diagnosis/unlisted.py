@@ -76,7 +76,7 @@ def reduction_of(data: ObservedMaps, made: Reconstruction, chosen: Sequence[int]
     :data:`LARGEST` times that of the scores: what else these elements hold, as a pattern's finer structure, would be
     put down to them, and powers grow faster than in proportion.
     """
-    _, plugins, _ = made.fitted(chosen)
+    _, plugins, rest = made.fitted(chosen)
     acting = [(made.search.grammar[k], one) for k, one in zip(chosen, plugins, strict=True) if one is not None]
     if plugins[0] is None:  # the others are what it leaves
         return None
@@ -88,7 +88,7 @@ def reduction_of(data: ObservedMaps, made: Reconstruction, chosen: Sequence[int]
         if by_map and len(made.scene.splits) > 1:
             if not len((half := structure.within(0, folds)).weights):
                 return None
-            own = made.x if len(chosen) == 1 else made.left(chosen) + made.made([effect])
+            own = made.x if len(chosen) == 1 else rest + made.made([effect])
             ((theta, _),) = made.search.fit([half], own)
             effect = plugin(effect.name, structure, theta, made.scene) or effect
         first.append(effect)

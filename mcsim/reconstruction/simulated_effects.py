@@ -174,7 +174,7 @@ class Reconstruction:
         tried = self._trial[member]
         self._kept[member] = amplitudes @ tried.coordinates, amplitudes @ tried.made
 
-    def left(self, chosen: Sequence[int]) -> Vector:
+    def left(self, chosen: list[int]) -> Vector:
         """Return the scores without what the effects of structures make of them on this sky."""
         _, plugins, rest = self.fitted(chosen)
         return self.x - sum(self._kept[k][1] for k in chosen) if None in plugins else rest
