@@ -157,7 +157,7 @@ def test_the_sky_of_maps_with_an_ellipse_is_found_through_it() -> None:
         off, left = (np.linalg.norm(one - expected) for one in (circular, skies.observed_with(ellipse)))
         assert left < 0.3 * off
     slight = [config.Effect(name="beam_ellipticity", channel="W1", parameters={"amplitude": 0.02})]
-    assert skies.seen(slight) == ((), (), (), "", "")
+    assert not any(skies.seen(slight))
 
 
 ADDED = [
@@ -184,7 +184,7 @@ def test_the_sky_of_maps_with_added_signals_is_found_without_them(
     assert off > 0.2 * np.linalg.norm(expected)
     step = analysis.candidates[0].basis[0].amplitude
     small = [config.Effect(name=name, channel=channel, parameters={**parameters, "amplitude": step})]
-    assert skies.seen(small) == ((), (), (), "", "")
+    assert not any(skies.seen(small))
 
 
 def test_the_dipole_that_a_gain_leaves_in_the_only_channel_is_a_residual_one() -> None:
