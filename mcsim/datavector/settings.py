@@ -282,7 +282,7 @@ class DiagnosisSettings:
         sims = ("sims_per_element", "pilot_sims_per_element", "worth_per_element")
         least: dict[str, float] = dict.fromkeys((*skies, *sims, "constrained_skies"), 2)
         one = ("max_effects", "odds_cut", "beam_orders", "beam_bins", "sky_bins", "scan_bins", "scan_L_max")
-        least |= dict.fromkeys((*one, "filter_iterations"), 1)
+        least |= dict.fromkeys((*one, "filter_iterations", "compared_sets"), 1)
         least |= {"scatter_skies": LEAST, "scan_sims": FEWEST, "large_scales": 3, "plane_width": 1e-3}
         check_settings(self, ["alpha", "named_probability", *levels], least)
         edges = list(self.latitude_edges)

@@ -188,10 +188,10 @@ def _candidates(data: DataSet, refined: Refined, correlation: Matrix) -> Iterato
     """Yield every candidate with its fit alone, what would be detected, and what is most like it.
 
     The last two follow from straight responses and the model's noise, whatever was found: ``correlation`` has shape
-    (C, C).
+    (C, C). Look-elsewhere counts the candidates that are proposed whatever the data are.
     """
     null, t, found, candidates = data.context.null, refined.templates, refined.attribution, refined.candidates
-    known, straight = data.context.of_model.null, refined.straight
+    known, straight, tests = data.context.of_model.null, refined.straight, len(data.context.analysis.candidates)
     rank = null.whiten_groups(t, [one.columns for one in candidates]).sizes
     for k, candidate in enumerate(candidates):
         columns = list(candidate.columns)
@@ -202,9 +202,9 @@ def _candidates(data: DataSet, refined: Refined, correlation: Matrix) -> Iterato
             amplitude, sigma, words = float("nan"), float("nan"), "no such amplitude"
         typical, fixed = candidate.typical, candidate.fixed
         at = "".join(f" at {name.replace('_', ' ')} {value:g}" for name, value in fixed.items())
-        reach, size = detectable(known, straight[:, columns], len(candidates), typical), None
+        reach, size = detectable(known, straight[:, columns], tests, typical), None
         responds = max(int(np.any(straight[:, columns] != 0.0, axis=0).sum()), 1)
-        needed = snr_needed(min(responds, known.dimension), len(candidates), known.dimension, known.dof + 1)
+        needed = snr_needed(min(responds, known.dimension), tests, known.dimension, known.dof + 1)
         if np.isfinite(reach):
             size = abs(candidate.with_coordinates(reach * typical[:, 0], np.eye(len(columns))).amplitude)
         # Candidates that differ in settings only are variants of one effect.
@@ -224,7 +224,7 @@ def _candidates(data: DataSet, refined: Refined, correlation: Matrix) -> Iterato
             sigma=sigma,
             words=words,
             delta_chi2=null.hartlap_factor * float(found.singles[k].delta_chi2),
-            pvalue=min(1.0, found.singles[k].nested_pvalue * int((rank > 0).sum())),
+            pvalue=min(1.0, found.singles[k].nested_pvalue * int((rank[:tests] > 0).sum())),
             detectable=size,
             detectable_words=_in_words(candidate, size, at),
             fixed=fixed,

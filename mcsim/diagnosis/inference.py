@@ -114,9 +114,11 @@ def confirmed(
     if reduction is None:
         return found, None
     if reduction.refutes(context.settings.reduction_sigma, context.settings.unexplained_pvalue):
-        best = " and ".join(context.candidates[member].title for member in found.explanations[0].members)
-        refusals.append(f"The best fit, {best}, is not named: {refuted(reduction)}.")
-        return found.unexplained(), None
+        best, *others = found.explanations
+        title = " and ".join(context.candidates[member].title for member in best.members)
+        alike = ", nor is what fits alike" if others else ""
+        refusals.append(f"The best fit, {title}, is not named{alike}: {refuted(reduction)}.")
+        return replace(found.unexplained(), contradicted=(*found.contradicted, best)), None
     if reduction.before.value < reduction.before.sigma:
         own = measured(reduction.before.value, reduction.before.sigma)
         notes.append(f"No reduction on held-out data is given: they show no excess χ² by themselves ({own}).")

@@ -22,6 +22,7 @@ def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[
     The effects of a set are simulated at their amplitudes, and these are compared in parts of the data. An effect whose
     pattern on the sky is drawn has no such response: it is told from other signals on the sky by its frequencies alone.
     Where another set agrees, one that parts contradict is not left out before it is ``odds_cut`` times less probable.
+    What is left has to be as probable as ``named_probability`` asks for without what was left out.
     """
     context, slices = data.context, slices_of(data)
     settings, candidates = context.settings, context.candidates
@@ -48,12 +49,21 @@ def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[
         else:
             kept.append(one)
     agreed = tuple(kept)
+    whole = sum(one.odds for one in found.explanations)
     for one, doubt in doubted:
         left_out = not _is_as_probable(one, agreed, settings.odds_cut)
         (refused if left_out else kept).append(replace(one, odds=one.odds * one.findings.bound))
         named = "is not named" if left_out else "stays in the set, for it is hardly told from what all parts agree with"
         sentences.append(f"The data vector fits {_title(candidates, one)}, which {named}: {doubt}.")
-    return replace(found.of(kept), contradicted=tuple(refused)), sentences
+    # The weight of what falls away goes to all else.
+    own, rest = (found.probability * sum(one.odds for one in each) / whole for each in (kept, refused))
+    probability = own / (own + rest + 1.0 - found.probability) if own else 0.0
+    left = replace(found.of(kept), probability=probability, contradicted=tuple(refused))
+    if kept and probability < settings.named_probability:
+        sets = "; and ".join(_title(candidates, one) for one in left.explanations)
+        sentences.append(f"No part contradicts {sets}, but that is not named with a probability of {probability:.2g}.")
+        left = left.unexplained()
+    return left, sentences
 
 
 def _is_as_probable(one: Explanation, agreed: Sequence[Explanation], cut: float) -> bool:

@@ -249,10 +249,14 @@ class InTime(Form):
         """Return the factor of the split that each time is in."""
         if len(set(self.splits)) == 1:
             return np.full(len(time_s), self.splits[0])
-        model, number = site.pointed(self.name).model, len(self.splits)
-        part_s = abs(model.spin_period_s) if self.by_rings else model.duration_days * SECONDS_PER_DAY / number
-        place = np.floor(np.asarray(time_s) / part_s).astype(int)
-        return np.array(self.splits)[place % number if self.by_rings else np.clip(place, 0, number - 1)]
+        pointing, number, values = site.pointed(self.name), len(self.splits), np.array(self.splits)
+        model = pointing.model
+        if self.by_rings:
+            return values[np.floor(np.asarray(time_s) / abs(model.spin_period_s)).astype(int) % number]
+        # By their numbers, as samples are divided among maps.
+        sample = np.rint(np.asarray(time_s) / model.period_of_samples(pointing.line))
+        ends = [round(part / number * model.samples(pointing.line)) for part in range(1, number)]
+        return values[np.searchsorted(ends, sample, side="right")]
 
     def over_time(self, time_s: Vector, psi: Vector | None, site: Site) -> Vector:
         """Return constant, pattern or wave."""

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from mcsim import systematics
 from mcsim.datavector.candidate import Candidate
@@ -34,3 +35,22 @@ def test_a_set_behind_others_that_parts_contradict_is_compared_too(monkeypatch):
     assert compared == list("ABCDEF")
     assert agreed.verdict == "unknown"
     assert len(sentences) == len(each)
+
+
+@pytest.mark.parametrize(("odds", "verdict"), [(1e-3, "effect"), (1e-5, "unknown")])
+def test_what_is_left_is_named_if_it_is_probable_without_what_fell_away(odds, verdict, monkeypatch):
+    """0.9999 of the probability was that of two sets, and the better one falls away."""
+    settings = DiagnosisSettings()
+    candidates = [Candidate(systematics.get("calibration"), channel, (k,)) for k, channel in enumerate("AB")]
+    fit = Fit(np.array([0.1]), np.eye(1) * 1e-6, 100.0, 100.0, 0.0, 1.0, 10, 0.5)
+    each = tuple(Explanation((k,), fit, own, 0.5, 0.5) for k, own in enumerate((1.0, odds)))
+    found = Attribution("degenerate", None, each, 0, 1.0, (fit, fit), (), 0.9999)
+    results = iter([Findings(maps=(MapCheck(("A",), 9.0, 9.0, 1.0, 1, 1e-30),), comparisons=((),)), Findings()])
+    monkeypatch.setattr(naming, "slices_of", lambda data: SimpleNamespace(findings=lambda *_: next(results)))
+    monkeypatch.setattr(naming, "_actions", lambda *_: [])
+    context = SimpleNamespace(settings=settings, candidates=candidates, run=SimpleNamespace(channels=[]))
+    left, sentences = naming.agreeing(SimpleNamespace(context=context), None, found)
+    assert left.verdict == verdict
+    assert [one.members for one in left.contradicted] == [(0,)]
+    np.testing.assert_allclose(left.probability, 0.9999 * odds / (0.9999 * odds + 1e-4 * (1.0 + odds)), rtol=1e-6)
+    assert len(sentences) == (1 if verdict == "effect" else 2)

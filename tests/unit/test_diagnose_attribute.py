@@ -362,6 +362,7 @@ def judged(bench: Bench, shrink: HeldOut) -> tuple[str, HeldOut | None, list[str
     notes: list[str] = []
     context = SimpleNamespace(candidates=bench.candidates, settings=DiagnosisSettings())
     after, kept = confirmed(context, found, shrink, notes, notes)
+    assert after.contradicted == (() if after.explanations else found.explanations)
     return after.verdict, kept, notes
 
 

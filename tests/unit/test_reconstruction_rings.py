@@ -12,6 +12,7 @@ from mcsim import config
 from mcsim.datavector.filter_model import Model, model_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import wiener_filter
+from mcsim.instrument.scan import MapGrid, ScanModel
 from mcsim.reconstruction import simulated_scores
 from mcsim.reconstruction.forms import InTime
 from mcsim.reconstruction.grammar import structures
@@ -103,3 +104,14 @@ def test_a_factor_of_rings_is_that_of_the_samples_in_them(sign):
     site = SimpleNamespace(pointed=lambda _: SimpleNamespace(model=SimpleNamespace(spin_period_s=sign * 129.3)))
     assert np.array_equal(InTime.factor(form, time_s, site) == 1.0, tod.on_rings(time_s, sign * 129.3, 2, 0))
     assert InTime.factor(form, time_s, site)[0] == 1.0
+
+
+@pytest.mark.parametrize("number", [2, 3, 7])
+def test_a_factor_of_parts_of_the_survey_is_that_of_the_samples_in_their_maps(number):
+    survey = replace(ScanModel.load("wmap").with_sampling(613.0), duration_days=11.0)  # no part has a whole number
+    line = survey.lines_of_sight[0]
+    site = SimpleNamespace(pointed=lambda _: SimpleNamespace(model=survey, line=line))
+    form = SimpleNamespace(name="parts", splits=tuple(range(number)), by_rings=False)
+    for part in range(number):
+        first, last = MapGrid(8, time_range=(part / number, (part + 1) / number)).sample_range(survey, line)
+        assert np.all(InTime.factor(form, 613.0 * np.arange(first, last), site) == part)
