@@ -153,10 +153,10 @@ def beam(
     """Print a beam's solid angle, widths, B_l and b_lm; draw it."""
     from mcsim.plot.look import look_at_beams
 
-    target = picture(output, source, "-beam")
-    for number, look in enumerate(look_at_beams(source, lmax, m_max, pixel_deg)):
+    target, looks = picture(output, source, "-beam"), list(look_at_beams(source, lmax, m_max, pixel_deg))
+    for look in looks:
         print(look.text)
-        save(look.figure, target if number == 0 else target.with_stem(f"{target.stem}-{look.name}"))
+        save(look.figure, target if len(looks) == 1 else target.with_stem(f"{target.stem}-{look.name}"))
 
 
 @app.command(cls=Command)

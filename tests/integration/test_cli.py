@@ -327,6 +327,9 @@ def test_beam_of_a_configuration_and_of_files(mcsim: Command, tmp_path: Path) ->
     assert code == 0
     assert "1.25" in out
     assert (tmp_path / "map.png").exists()
+    two = Path(__file__).parents[2] / "workflows" / "demo-model.toml"
+    assert mcsim("beam", two, "--lmax", 300, "-o", "of.png")[0] == 0
+    assert sorted(one.name for one in tmp_path.glob("of*")) == ["of-V1.png", "of-W1.png"]
 
 
 def test_scan(mcsim: Command, tmp_path: Path) -> None:
