@@ -12,6 +12,7 @@ from mcsim import config
 from mcsim.datavector.analysis import Analysis
 from mcsim.datavector.campaign import Ask, after_jobs, without_repeats
 from mcsim.datavector.candidate import Candidate, TemplateBank
+from mcsim.datavector.halves import Halves
 from mcsim.datavector.localisation import Place
 from mcsim.datavector.nuisances import with_nuisances
 from mcsim.datavector.null_ensemble import NullEnsemble
@@ -123,6 +124,16 @@ class DataSet(ABC, Generic[Data]):
     @abstractmethod
     def halves(self) -> tuple[Matrix, str]:
         """Return a matrix that makes the two folds of the data vector independent, and what they are in words."""
+
+    def in_halves(self, change: Vector) -> tuple[Halves, Matrix, str] | None:
+        """Return what fits one half and tests the other, with the two of :meth:`halves`.
+
+        None if there are no halves, or if a change of the data vector, shape (p,), hardly shows in one of them.
+        """
+        matrix, words = self.halves()
+        halves = Halves.of(self.context.ensemble.remix(matrix), matrix @ self.x)
+        least = self.context.settings.half_snr_share * self.context.null.expected_snr(change)
+        return None if halves is None or halves.expected_snr(matrix @ change) < least else (halves, matrix, words)
 
     @abstractmethod
     def places(self) -> list[Place]:

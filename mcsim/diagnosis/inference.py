@@ -12,7 +12,6 @@ from scipy.linalg import block_diag
 from mcsim import config
 from mcsim.datavector.bent import bent_templates
 from mcsim.datavector.candidate import columns_of, parts_of, scatters_of, tables_at, tables_beside
-from mcsim.datavector.halves import Halves
 from mcsim.datavector.nuisances import with_priors
 from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
@@ -213,12 +212,10 @@ def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:
     members, best = refined.attribution.explanations[0].members, refined.attribution.explanations[0].fit
     t = refined.templates[:, columns_of(context.candidates, members)]
     scatters = scatters_of(refined.candidates, members)
-    snr = context.null.expected_snr(t @ best.amplitudes)
-    matrix, words = data.halves()
-    t, scatters = matrix @ t, [matrix @ one for one in scatters]
-    halves = Halves.of(context.ensemble.remix(matrix), matrix @ data.x)
-    if halves is None or halves.expected_snr(t @ best.amplitudes) < context.settings.half_snr_share * snr:
+    if (apart := data.in_halves(t @ best.amplitudes)) is None:
         return None
+    halves, matrix, words = apart
+    t, scatters = matrix @ t, [matrix @ one for one in scatters]
     parts = parts_of(context.candidates, members, best)
     free = block_diag(
         *(

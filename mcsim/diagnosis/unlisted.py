@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from mcsim.datavector.campaign import Ask
-from mcsim.datavector.halves import Halves
 from mcsim.datavector.nuisances import NuisanceResult
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
@@ -80,7 +79,6 @@ def reduction_of(data: ObservedMaps, made: Reconstruction, chosen: Sequence[int]
     acting = [(made.search.grammar[k], one) for k, one in zip(chosen, plugins, strict=True) if one is not None]
     if plugins[0] is None:  # the others are what it leaves
         return None
-    context, settings = data.context, data.context.settings
     folds = [view.split % 2 for view in made.scene.views]
     first = []
     for structure, effect in acting:
@@ -92,16 +90,13 @@ def reduction_of(data: ObservedMaps, made: Reconstruction, chosen: Sequence[int]
             ((theta, _),) = made.search.fit([half], own)
             effect = plugin(effect.name, structure, theta, made.scene) or effect
         first.append(effect)
-    matrix, told = data.halves()
-    if (halves := Halves.of(context.ensemble.remix(matrix), matrix @ data.x)) is None:
-        return None
     t = np.stack([made.simulated([one], tested=True).x - made.before.x for one in first], axis=1)
-    snr, t = context.null.expected_snr(t.sum(axis=1)), matrix @ t
-    if halves.expected_snr(t.sum(axis=1)) < settings.half_snr_share * snr:
+    if (apart := data.in_halves(t.sum(axis=1))) is None:
         return None
+    halves, matrix, words = apart
 
     def respond(frozen: Fit) -> Vector:
         scaled = [one.scaled(float(a)) for one, a in zip(first, frozen.amplitudes, strict=True)]
         return np.asarray(matrix @ (made.simulated(scaled, tested=True).x - made.before.x))
 
-    return replace(halves, largest=LARGEST).reduction(t, respond, (), told)
+    return replace(halves, largest=LARGEST).reduction(matrix @ t, respond, (), words)

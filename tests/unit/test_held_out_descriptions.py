@@ -13,6 +13,7 @@ from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element
 from mcsim.diagnosis import unlisted
+from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.inference import reduction_of
 from mcsim.reconstruction.simulated_effects import Reconstruction
 from mcsim.stats.excess import HeldOut, Measured
@@ -100,6 +101,7 @@ def test_a_half_whose_fit_its_own_response_contradicts_measures_nothing(turned, 
         candidates=[candidate], null=ensemble.gaussian, ensemble=ensemble, settings=DiagnosisSettings()
     )
     data = SimpleNamespace(context=context, x=x, halves=lambda: (np.eye(8), "half2"), respond=respond)
+    data.in_halves = lambda change: DataSet.in_halves(data, change)
     attribution = SimpleNamespace(explanations=[SimpleNamespace(members=(0,), fit=fit)])
     found = reduction_of(data, SimpleNamespace(attribution=attribution, templates=t, candidates=[candidate]))
     assert (found is not None) == measured

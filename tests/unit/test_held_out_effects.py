@@ -11,6 +11,7 @@ from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element
+from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.inference import reduction_of
 from mcsim.systematics.parametrization import PowerLaw
 
@@ -56,6 +57,7 @@ def test_a_power_law_that_draws_nothing_has_a_reduction():
         halves=lambda: (np.eye(8), "halves"),
         respond=lambda tables, skies: np.tile(t @ coordinates, (skies, 1)),
     )
+    data.in_halves = lambda change: DataSet.in_halves(data, change)
     found = SimpleNamespace(explanations=[SimpleNamespace(members=(0,), fit=fit)])
     reduction = reduction_of(data, SimpleNamespace(attribution=found, templates=t, candidates=[candidate]))
     assert reduction is not None
