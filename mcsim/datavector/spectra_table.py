@@ -116,6 +116,15 @@ class Spectra:
                     yield own, turned.imag if row.imaginary else turned.real
 
 
+def _check_filter(path: str | Path, stated: str, needed: str) -> None:
+    """Raise InputError for spectra of maps that were filtered otherwise than those of the model."""
+    if stated != needed:
+        raise InputError(
+            f'{path} has spectra of maps with filter = "{stated}", the model has [biposh] filter = "{needed}"; set that '
+            f'to "{stated}", or take spectra that agree.'
+        )
+
+
 def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
     """Read measured spectra that a run claims to describe; raise InputError if they say too little or go beyond it.
 
@@ -123,9 +132,11 @@ def read_spectra(path: str | Path, run: config.RunConfig) -> Spectra:
     in the Bennett normalisation are C_l. Several pairs stand together; without a column ``pair`` the table belongs to
     the first map. Without ``value_imag`` only real parts are used; ``error`` may be left out. The header's ``meta``
     must give ``normalisation``, ``scaling`` and, unless all rows have L = 0, ``frame``; ``realizations`` says of how
-    many skies the values are the mean (default: 1), ``lmax`` where the maps end (default: as the model).
+    many skies the values are the mean (default: 1), ``lmax`` where the maps end (default: as the model), and ``filter``
+    how they were filtered, which has to be the run's ``biposh.filter`` (default: not at all).
     """
     table = read_ecsv(path)
+    _check_filter(path, str(table.meta.get("filter", "none")), run.biposh.filter)
     scaling, known, lmax = scaling_of(path, table.meta), _pairs(run), config.analysis_lmax(run)
     absent, highest = np.full(len(table), np.nan), highest_of(path, table.meta)
     real = in_uk2(path, table, "value")

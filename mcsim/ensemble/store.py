@@ -304,8 +304,10 @@ def extend(path: Path, realizations: int, update: Mapping[str, Any]) -> None:
     one.
     """
     with refuse_unwritable(path):
-        group = _open(path, "r+")
-        growing = {name: array for name, array in group.arrays() if _over_realizations(array)}
+        # Realization 0 may have a chunk of its own, whose only number is the fill value.
+        with zarr.config.set({"array.write_empty_chunks": True}):
+            group = _open(path, "r+")
+            growing = {name: array for name, array in group.arrays() if _over_realizations(array)}
         last = growing.pop("done")
         for array in growing.values():
             array.resize((realizations, *array.shape[1:]))

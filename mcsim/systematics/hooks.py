@@ -36,6 +36,7 @@ _RETURNED = {
 
 _OBJECTS = {"beam": Beam, "pointing": Beam, "orientations": Moments}
 _OPTIONAL = ("gain", "noise", "moved", "lags")  #: hooks that may return None
+ROUNDING = 1e-9  #: relative size of what may be wrong with numbers that a hook returns
 
 
 class HookError(InputError):
@@ -69,11 +70,16 @@ def _guarded(hook: str, function: Callable[..., Any]) -> Callable[..., Any]:
             flaw = _flaw(hook, found, (*given, *named.values()))
         except InputError:
             raise
-        except Exception as error:  # whatever a user's code does
+        except (Exception, SystemExit) as error:  # whatever a user's code does
             remedy = "let it change a copy" if "read-only" in str(error) else "mend it"
             raise HookError(f"{what} fails ({type(error).__name__}: {error}); {remedy}.") from error
         if flaw is not None:
             raise HookError(f"{what} returns {flaw}; let it return {_RETURNED[hook]}.")
+        if hook == "noise" and found is not None and (least := float(np.min(found))) < -ROUNDING:
+            raise InputError(
+                f"{what} makes a variance negative at amplitude = {effect.amplitude:g} ({least:.3g} times that of the "
+                "model); choose a smaller one, or let the effect have a bound."
+            )
         return found
 
     return call
@@ -100,7 +106,11 @@ def _flaw(hook: str, found: Any, given: Sequence[Any]) -> str | None:
     wanted = _shape(hook, values, given)
     if values.shape != wanted:
         return f"an array of shape {values.shape}, where {wanted} is needed"
-    return f"values of type {values.dtype}" if np.iscomplexobj(values) != (hook == "sky") else None
+    if values.dtype.kind not in ("c" if hook == "sky" else "fiu"):
+        return f"values of type {values.dtype}"
+    if hook == "sky" and np.any(np.abs(values[: given[1].lmax + 1].imag) > ROUNDING * np.max(np.abs(values))):
+        return "coefficients of m = 0 that are not real"
+    return None
 
 
 def _shape(hook: str, values: np.ndarray, given: Sequence[Any]) -> tuple[int, ...]:

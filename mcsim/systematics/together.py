@@ -1,13 +1,16 @@
 """What the effects that act in a channel do together."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from mcsim.instrument.beams import Beam
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import rng
+from mcsim.support.arrays import Vector
 from mcsim.systematics.base import Alm, Effect, Map, Site, acts_through
+from mcsim.systematics.hooks import ROUNDING, HookError
 
 UNIFORM = 1e-9  #: relative departure of a beam from a multiple of another one that is round-off
 
@@ -76,7 +79,7 @@ def disturbing(acting: Iterable[Effect]) -> list[tuple[Effect, str]]:
 
 
 def tried(acting: Sequence[Effect], site: Site) -> Beam:
-    """Return the beam that effects make; raise InputError for one that cannot act in this channel."""
+    """Return the beam that effects make; raise InputError for one that cannot act here, or does so at amplitude 0."""
     once = np.zeros(1)
     looked_at(acting, np.zeros(alm_.size(site.lmax), dtype=np.complex128), site, 0, 0)
     for effect in acting:
@@ -85,12 +88,30 @@ def tried(acting: Sequence[Effect], site: Site) -> Beam:
         effect.noise(site)
         effect.knee(1.0)
         effect.differencing(0.0, 0)
+        _refuse_if_always_there(replace(effect, amplitude=0.0), site, once)
     for effect in adding(acting):
         site.pointed(effect.name)
         effect.signal(once, once, once, once, site)
     for effect, _ in disturbing(acting):
         effect.excess(once, rng.generator(0, 0, "tried"))
     return seen_through(acting, site)
+
+
+def _refuse_if_always_there(none: Effect, site: Site, time_s: Vector) -> None:
+    """Raise HookError for an effect of amplitude zero that changes something."""
+    found: dict[str, tuple[object, object]] = {
+        "gain": (none.gain(time_s, site), 0.0),
+        "steady_gain": (none.steady_gain(site), 0.0),
+        "noise": (none.noise(site), 1.0),
+        "knee": (none.knee(1.0), 1.0),
+        "spread": (none.spread(), 1.0),
+        "differencing": (none.differencing(0.0, 0), 0.0),
+    }
+    for hook, (value, nothing) in found.items():
+        if value is not None and np.any(np.abs(np.asarray(value) - nothing) > ROUNDING):
+            raise HookError(
+                f"effect {none.name}: its {hook} changes the simulation at amplitude = 0; let it change nothing there."
+            )
 
 
 def looked_at(acting: Iterable[Effect], sky: Alm, site: Site, seed: int, realization: int) -> Alm:

@@ -19,6 +19,7 @@ from distributed import Client
 from mcsim import config, open_ensemble
 from mcsim.ensemble import opening, prediction, runner, store, summary
 from mcsim.ensemble.describe import describe
+from mcsim.ensemble.repair import verify
 from mcsim.ensemble.runner import cluster
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
@@ -130,6 +131,16 @@ def test_extension_keeps_what_is_there_and_gives_the_bits_of_one_run(
     assert runner.run(table(**ensemble(3)), path, workers=client).computed == 3
     assert runner.run(table(**ensemble(10)), path, workers=client).computed == 7
     assert_same(path, small_store)
+
+
+def test_a_store_of_one_realization_is_extended_and_whole(client: Client, tmp_path: Path) -> None:
+    """Its only chunk of the coordinate holds zero alone, which stands for what is not written."""
+    path = tmp_path / "one.zarr"
+    runner.run(table(**ensemble(1)), path, workers=client)
+    runner.run(table(**ensemble(3)), path, workers=client)
+    assert verify(path).intact
+    with open_ensemble(path) as found:
+        assert found["realization"].values.tolist() == [0, 1, 2]
 
 
 def test_an_extension_that_ends_before_the_store_has_grown_is_completed(

@@ -118,6 +118,19 @@ def test_tables_of_the_model_have_no_gap(small, tmp_path):
     assert "none" in [verdict["verdict"] for verdict in verdicts]
 
 
+@pytest.mark.parametrize(("stated", "needed"), [("inverse_covariance", "none"), (None, "inverse_covariance")])
+def test_a_table_of_maps_that_were_filtered_otherwise_is_refused(stated, needed, tmp_path):
+    """They have another response and scatter: spectra of the model itself were a gap of p = 1e-65."""
+    noisy = replace(RUN.channels[0], noise=config.Noise(sigma0_uk=20.0))
+    table, run = measured(RUN), replace(RUN, channels=(noisy,), biposh=replace(RUN.biposh, filter=needed))
+    if stated is not None:
+        table.meta["filter"] = stated
+    with refused("table.ecsv", "none", "inverse_covariance"):
+        read(tmp_path, table, run)
+    table.meta["filter"] = needed
+    assert len(read(tmp_path, table, run).rows)
+
+
 def test_the_mean_of_skies_scatters_as_the_tests_take_it_to(small):
     raw = small.ensemble.simulations
     back = replace(small.ensemble, simulations=np.random.default_rng(1).normal(size=raw.shape)).of_mean(50)

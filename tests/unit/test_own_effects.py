@@ -13,6 +13,7 @@ from mcsim.simulation import simulate
 from mcsim.simulation.nuisance import DisturbedSurvey, tables
 from mcsim.simulation.survey import survey
 from mcsim.systematics import Site
+from refusals import refused
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,3 +87,30 @@ def test_a_nuisance_acts_as_the_effect_that_is_drawn(kind):
 def test_the_page_on_effects_lists_what_a_hook_can_know_of_its_site():
     page = (Path(__file__).parents[2] / "docs" / "howto" / "effect.md").read_text("utf-8")
     assert [one.name for one in fields(Site) if f"\n| `{one.name}` |" not in page] == []
+
+
+def imaginary(self, sky, site, draw):
+    return sky + 1j
+
+
+def quits(self, sky, site, draw):
+    raise SystemExit(3)
+
+
+FLAWS = {
+    "a variance below zero": ("noise", lambda self, site: np.full(12 * site.nside**2, -2.2), ("-2.2", "0.5", "noise")),
+    "a flag for a gain": ("gain", lambda self, time_s, site: time_s >= 0.0, ("bool", "gain")),
+    "a gain at amplitude zero": ("gain", lambda self, time_s, site: np.full(np.shape(time_s), 0.01), ("gain", "= 0;")),
+    "a variance at amplitude zero": ("noise", lambda self, site: np.full(12 * site.nside**2, 2.0), ("noise", "= 0;")),
+    "a sky that is not real": ("sky", imaginary, ("sky", "m = 0", "real")),
+    "a program's end": ("sky", quits, ("sky", "SystemExit")),
+}
+
+
+@pytest.mark.parametrize("flaw", FLAWS)
+def test_what_a_hook_must_not_return_is_refused_before_a_run(flaw):
+    hook, function, named = FLAWS[flaw]
+    kind = dataclass(frozen=True, kw_only=True)(type("Hooked", (Own,), {"name": "hooked", hook: function}))
+    site = survey(config.load(two_channels("hooked"))).channels[0].site
+    with refused("hooked", *named):
+        systematics.tried((kind(amplitude=0.5),), site)
