@@ -72,8 +72,9 @@ class DiagnosisSettings:
         Standard deviations by which a fractional reduction on held-out data may miss its prediction, or zero.
     unexplained_pvalue
         P-value up to which what remains of held-out data contradicts effects that leave more than half of their excess.
-    half_snr_share
-        Share of an effect's expected S/N that each half needs for a reduction to be measured.
+    half_snr_share, half_snr
+        Share of an effect's expected S/N that each half needs for a reduction to be measured, and the S/N that suffices
+        whatever its share.
     consistency_level
         Global p-value of the comparisons of an effect's amplitude in independent parts of the data, and of what it
         leaves in them, up to which it is not named.
@@ -216,6 +217,7 @@ class DiagnosisSettings:
     reduction_sigma: float = 3.0
     unexplained_pvalue: float = 1e-3
     half_snr_share: float = 0.2
+    half_snr: float = 5.0
     consistency_level: float = 0.01
     absence_odds: float = 20.0
     consistency_error: float = 0.05

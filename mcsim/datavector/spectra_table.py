@@ -120,8 +120,8 @@ def _check_filter(path: str | Path, stated: str, needed: str) -> None:
     """Raise InputError for spectra of maps that were filtered otherwise than those of the model."""
     if stated != needed:
         raise InputError(
-            f'{path} has spectra of maps with filter = "{stated}", the model has [biposh] filter = "{needed}"; set that '
-            f'to "{stated}", or take spectra that agree.'
+            f'{path} has spectra of maps with filter = "{stated}", and the model has [biposh] filter = "{needed}"; set '
+            f'that to "{stated}", or take spectra that agree.'
         )
 
 

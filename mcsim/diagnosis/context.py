@@ -130,9 +130,9 @@ class DataSet(ABC, Generic[Data]):
 
         None if there are no halves, or if a change of the data vector, shape (p,), hardly shows in one of them.
         """
-        matrix, words = self.halves()
+        (matrix, words), settings = self.halves(), self.context.settings
         halves = Halves.of(self.context.ensemble.remix(matrix), matrix @ self.x)
-        least = self.context.settings.half_snr_share * self.context.null.expected_snr(change)
+        least = min(settings.half_snr_share * self.context.null.expected_snr(change), settings.half_snr)
         return None if halves is None or halves.expected_snr(matrix @ change) < least else (halves, matrix, words)
 
     @abstractmethod

@@ -30,6 +30,7 @@ from mcsim.stats.gaussian import Fit
 from mcsim.stats.scattered import with_drawn_scatter, with_scatter, with_tangents
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.numbers import measured
+from mcsim.systematics import acts_through
 
 EXPLAINED = 0.5  #: share of the excess chi^2 that a single effect explains which is more likely than an exchange
 
@@ -215,6 +216,8 @@ def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:
     if (apart := data.in_halves(t @ best.amplitudes)) is None:
         return None
     halves, matrix, words = apart
+    if any(acts_through(context.candidates[member].effect, "steady_gain") for member in members):
+        words += ": of what these have in common, alternate degrees and pixels"
     t, scatters = matrix @ t, [matrix @ one for one in scatters]
     parts = parts_of(context.candidates, members, best)
     free = block_diag(

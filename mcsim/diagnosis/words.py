@@ -160,8 +160,12 @@ def held_out(result: DiagnosisResult) -> str:
     """Return what adding the effects to the simulator does to data that the fit did not use."""
     found = result.held_out
     if found is None:
-        why = "a half of the data hardly measures the effects, or the held-out one shows no excess χ² by itself"
-        return f"Not measured: {why if result.sets else 'no effect was added to the simulator'}."
+        if not result.sets:
+            return "Not measured: no effect was added to the simulator."
+        return (
+            "Not measured: a half of the data hardly measures the effects, or asks for what they cannot be, or the "
+            "held-out one shows no excess χ² by itself."
+        )
     start, forecast = "Adding the best fit to the simulator removes", f"; {percent(found.predicted)} was predicted"
     return _removed(found, start, forecast)
 

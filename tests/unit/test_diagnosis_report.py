@@ -107,7 +107,7 @@ def bench(nearest_candidates: bool) -> SimpleNamespace:
     fiducial = SimpleNamespace(frame="ecliptic", parts=[SimpleNamespace(name=name) for name in (EVIL, "V")])
     context = SimpleNamespace(
         run=replace(config.load(resources.workflow("quickstart")), name=EVIL),
-        analysis=SimpleNamespace(elements=tuple(elements()), model=fiducial),
+        analysis=SimpleNamespace(elements=tuple(elements()), model=fiducial, candidates=candidates),
         settings=DiagnosisSettings(beam_bins=(5, 2, 2, 1, 1), place_pvalue=0.0123),
         ensemble=SimpleNamespace(**held, residual_rms=1.0 + 0.1 * spread, nuisances=None),
         null=model,

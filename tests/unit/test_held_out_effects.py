@@ -62,3 +62,15 @@ def test_a_power_law_that_draws_nothing_has_a_reduction():
     reduction = reduction_of(data, SimpleNamespace(attribution=found, templates=t, candidates=[candidate]))
     assert reduction is not None
     assert reduction.achieved.value == pytest.approx(1.0, abs=4.0 * reduction.achieved.sigma)
+
+
+@pytest.mark.parametrize(("of_both", "in_each", "seen"), [(300.0, 10.0, True), (300.0, 2.0, False), (10.0, 3.0, True)])
+def test_halves_that_see_an_effect_well_test_it_however_much_the_rest_sees(of_both, in_each, seen):
+    """An S/N of 10 in each half is enough; of 2 beside 300 it is not, but 3 beside 10 is."""
+    elements = tuple(Element(f"e{k}", "noise", ("W1",), fold=fold) for k, fold in enumerate((0, 1, None)))
+    simulations = np.random.default_rng(8).normal(size=(4000, 3))
+    empty = np.zeros((0, 3))
+    ensemble = NullEnsemble(simulations, np.zeros(3), elements, empty, empty, empty, empty, empty)
+    context = SimpleNamespace(ensemble=ensemble, null=ensemble.gaussian, settings=DiagnosisSettings())
+    data = SimpleNamespace(context=context, x=np.zeros(3), halves=lambda: (np.eye(3), "halves"))
+    assert (DataSet.in_halves(data, np.array([in_each, in_each, of_both])) is not None) == seen
