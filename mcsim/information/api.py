@@ -231,9 +231,10 @@ def _with_declared(run: config.RunConfig, settings: LimitSettings) -> tuple[conf
         library[one.effect.name] = one.effect
         name = one.effect.name if one.channel is None else f"{one.effect.name}:{one.channel}"
         if one.settings or one.parameter_widths or len(set(one.widths)) > 1:
+            every = ", which is one for each split" if "split" in one.settings else ""
             raise InputError(
                 f"nuisance {name} of the run has parameters, or several widths, and a limit knows one width for an "
-                f"effect; leave the table out, and give --nuisance {name}={max(one.widths):g}."
+                f"effect; leave the table out, and give --nuisance {name}={max(one.widths):g}{every}."
             )
         found[name] = float(one.sigma[0])
     for text, width in settings.nuisances.items():
@@ -287,7 +288,7 @@ def _candidates(
             priors.setdefault(candidate.identity, []).append(candidate)
         elif not settings.only or candidate.name in settings.only:
             wanted.append(candidate)
-    wanted += map(_of_prior, priors.values())
+    wanted += [one for variants in priors.values() for one in _of_prior(variants)]
     for candidate in wanted:
         fit = candidate.parametrization
         if fit.stochastic and fit.mean_response and fit.sign >= 0:
@@ -304,12 +305,15 @@ def _candidates(
     return analysis, numbered(wanted)
 
 
-def _of_prior(variants: Sequence[Candidate]) -> Candidate:
-    """Return a nuisance in the coordinates of its prior: with the effect's own parameters, none of them fitted."""
+def _of_prior(variants: Sequence[Candidate]) -> list[Candidate]:
+    """Return a nuisance in the coordinates of its prior: with the effect's own parameters, none of them fitted.
+
+    One that has no parameters of its own, as what acts in one split, is there with those of every variant.
+    """
     usual = vars(variants[0].effect()).items()
-    own = next((one for one in variants if one.settings.items() <= usual), variants[0])
-    columns = tuple(range(len(own.effect.parametrization.basis())))
-    return replace(own, columns=columns, fit=None)
+    own = [one for one in variants if one.settings.items() <= usual][:1] or variants
+    columns = tuple(range(len(own[0].effect.parametrization.basis())))
+    return [replace(one, columns=columns, fit=None) for one in own]
 
 
 def _is_nuisance(candidate: Candidate, settings: LimitSettings) -> bool:

@@ -366,6 +366,22 @@ def test_nuisance_has_its_own_coordinates(nuisance: str, where: str | None, targ
     assert ("mean shape" in found.unknowns) == (nuisance == "foreground_residual")
 
 
+def test_a_nuisance_of_single_splits_is_one_for_each() -> None:
+    """That of the first split alone left sigma of a calibration a quarter of what it is."""
+    settings = mcsim.LimitSettings(only=("calibration", "split_calibration"), dense=True)
+    every = mcsim.limit(model(), settings=settings)
+    own = replace(settings, only=("calibration",), nuisances={"split_calibration": 0.003})
+    found = mcsim.limit(model(), settings=own)
+    kept = [k for k, name in enumerate(every.components) if name.startswith("calibration")]
+    assert len(every.components) == 3 * len(kept)  # two splits
+    others = [k for k in range(len(every.components)) if k not in kept]
+    expected = marginalised(every.fisher, others, [0.003] * len(others))
+    np.testing.assert_allclose(found.fisher, expected, rtol=1e-6, atol=1e-9 * expected.max())
+    of_one = {"effect": "split_calibration", "channel": "V1", "width": 0.003, "parameters": {"split": "half2"}}
+    with refused("split_calibration:V1=0.003"):
+        mcsim.limit(model(nuisance=[of_one]), settings=settings)
+
+
 def test_noise_that_is_not_white_is_refused() -> None:
     noise = {"kind": "correlated", "sigma0_uk": 200.0, "f_knee_hz": 1e-5, "f_min_hz": 1e-7, "alpha": 1.0}
     with refused("V1:half1", "V1", "white"):
