@@ -156,10 +156,15 @@ def run(folder: str | Path, *, workers: Workers | None = None, quiet: bool = Tru
 
     The folder, filled by :func:`make`, gets ``verdicts/case-NNN`` with ``verdict.json`` and ``answer.json`` (the data
     vector and the fits behind the verdict). ``workers`` as for :func:`make`.
-    InputError if the folder holds no challenge, or cases that have keys are lost.
+    InputError if the folder holds no challenge, or verdicts on other data, or cases that have keys are lost.
     """
     target = user_path(folder)
-    missing = [case for case in files.all_cases(target) if not files.is_answered(target, case)]
+    missing = []
+    for case in files.all_cases(target):
+        if files.is_answered(target, case):
+            files.check_answer(target, case)
+        else:
+            missing.append(case)
     settings = Settings.read(target)
     if missing:
         # Cases of one library follow each other, so that a worker seldom changes its library.
@@ -177,6 +182,7 @@ def diagnose_case(settings: Settings, folder: Path, case: str, without: tuple[st
     known = model.context.of_pixel_means if of_pixel_means(*seen) else model.context
     found = diagnose_data(ObservedMaps(known, maps, model.simulate), case)
     answer = {
+        "seal": files.seal(folder, case),
         "evidence": [float(value) for value in found.data],
         "maximum": found.test.maximum,
         "explanations": [
@@ -190,7 +196,7 @@ def diagnose_case(settings: Settings, folder: Path, case: str, without: tuple[st
     }
     with appearing(folder / files.VERDICTS / case) as scratch:
         (scratch / "verdict.json").write_text(json.dumps(found.to_json(), indent=1, allow_nan=False) + "\n")
-        (scratch / "answer.json").write_text(json.dumps(answer) + "\n")
+        (scratch / files.ANSWER).write_text(json.dumps(answer) + "\n")
 
 
 def _each_case(call: Batch, task: Callable[..., None], arguments: Sequence[tuple[Any, ...]], quiet: bool) -> None:

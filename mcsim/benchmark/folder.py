@@ -17,7 +17,7 @@ from mcsim.support.numbers import some
 
 NO_KEY = "restore it, or make another challenge in a new folder"
 SETTINGS, MAPS, KEYS, SEAL, VERDICTS = "challenge.json", "cases", "keys", "SEAL", "verdicts"
-MODEL, QUESTION = "model.toml", "question.json"
+MODEL, QUESTION, ANSWER = "model.toml", "question.json", "answer.json"
 
 
 @dataclass(frozen=True)
@@ -146,11 +146,7 @@ def key_hash(folder: Path, case: str) -> str:
 def open_key(folder: Path, case: str) -> Truth:
     """Read the key of a case; InputError if it has changed since its hash was published with the maps."""
     truth = read_key(folder, case)
-    path = folder / MAPS / case / SEAL
-    seal = path.read_bytes().split()[:1]
-    if not seal or re.fullmatch(rb"[0-9a-f]{64}", seal[0]) is None:
-        raise InputError(f"{path} does not begin with a SHA-256 of 64 hexadecimal digits; restore it.")
-    if seal != [key_hash(folder, case).encode()]:
+    if seal(folder, case) != key_hash(folder, case):
         raise InputError(
             f"{key_path(folder, case)} is not the key that was sealed: its SHA-256 is not that of {case}/{SEAL}; "
             "restore it."
@@ -158,12 +154,17 @@ def open_key(folder: Path, case: str) -> Truth:
     return truth
 
 
+def names_of_effects(settings: Settings) -> set[str]:
+    """Return the names of the effects that a verdict can have."""
+    return {*systematics.catalogue(), *(systematics.get(name).name for name in settings.including)}
+
+
 def question(settings: Settings, folder: Path, case: str) -> tuple[str, ...]:
     """Return the effects that the diagnosis of a case must not propose; InputError if the folder does not say so."""
     path = folder / MAPS / case / QUESTION
     plain = read_json(path, "restore it")
     names = plain.get("without") if isinstance(plain, dict) else None
-    known = {*systematics.catalogue(), *(systematics.get(name).name for name in settings.including)}
+    known = names_of_effects(settings)
     if not isinstance(names, list) or not all(isinstance(name, str) and name in known for name in names):
         raise InputError(f'{path} must have a list "without" of names of effects, not {names!r}; restore it.')
     return tuple(names)
@@ -193,6 +194,26 @@ def is_answered(folder: Path, case: str) -> bool:
     path = folder / VERDICTS / case
     not_a_file(path)
     return path.is_dir()
+
+
+def check_answer(folder: Path, case: str) -> None:
+    """Raise InputError for a verdict on other data than those of the case, whose answer has another seal."""
+    path, remedy = folder / VERDICTS / case, "and give mcsim challenge run again"
+    if not (path / ANSWER).exists():
+        return
+    answer = read_json(path / ANSWER, f"delete {path}, {remedy}")
+    told = answer.get("seal") if isinstance(answer, dict) else None
+    if told is not None and told != seal(folder, case):
+        raise InputError(f"{path} is of other data than {folder / MAPS / case}; delete it, {remedy}.")
+
+
+def seal(folder: Path, case: str) -> str:
+    """Return the SHA-256 that was published with the maps of a case, in hexadecimal; InputError if it is none."""
+    path = folder / MAPS / case / SEAL
+    found = path.read_bytes().split()[:1]
+    if not found or re.fullmatch(rb"[0-9a-f]{64}", found[0]) is None:
+        raise InputError(f"{path} does not begin with a SHA-256 of 64 hexadecimal digits; restore it.")
+    return found[0].decode()
 
 
 def all_cases(folder: Path) -> list[str]:

@@ -1,6 +1,6 @@
 """Score the verdicts on full skies beside their keys, and draws of the data vector, without maps, like them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -46,6 +46,8 @@ def score(folder: str | Path, *, workers: Workers | None = None, quiet: bool = T
     not_a_file(target / "score")
     made = files.all_cases(target)
     cases = [case for case in made if files.is_answered(target, case)]
+    for case in cases:
+        files.check_answer(target, case)
     if not cases:
         raise InputError(f"{folder} has no verdicts; run mcsim challenge run {folder} first.")
     settings, truths = Settings.read(target), [files.open_key(target, case) for case in cases]
@@ -108,11 +110,12 @@ def _record(settings: Settings, truth: Truth, folder: Path, bayes: BayesClassifi
     """Compare the key of a case with the verdict in a folder."""
     model, full = learned_model(settings, truth.without), bayes.sampler.effects_library
     remedy = f"delete {folder} and run mcsim challenge run again"
-    verdict, answer = (read_json(folder / name, remedy) for name in ("verdict.json", "answer.json"))
+    verdict, answer = (read_json(folder / name, remedy) for name in ("verdict.json", files.ANSWER))
     try:
         if verdict["case"] != truth.case:
             raise ValueError(f"it is of {verdict['case']}")
-        said, x = _said(truth, verdict, answer, full), _numbers(answer["evidence"], len(model.rows))
+        known = files.names_of_effects(settings)
+        said, x = _said(truth, verdict, answer, full, known), _numbers(answer["evidence"], len(model.rows))
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise InputError(f"{folder} holds no verdict ({error}); {remedy}.") from error
     response, members = full.response(truth.members), truth.members
@@ -126,15 +129,23 @@ def _record(settings: Settings, truth: Truth, folder: Path, bayes: BayesClassifi
 
 
 def _said(
-    truth: Truth, verdict: Mapping[str, Any], answer: Mapping[str, Any], library: EffectsLibrary
+    truth: Truth,
+    verdict: Mapping[str, Any],
+    answer: Mapping[str, Any],
+    library: EffectsLibrary,
+    known: Set[str],
 ) -> dict[str, Any]:
-    """Return what a record says of the verdict."""
+    """Return what a record says of the verdict; ValueError if it names other effects than the ``known`` ones."""
     sets = [verdict["effects"], *verdict["alternatives"]] if verdict["effects"] else []
+    word = _word(verdict["verdict"], sets)
+    answers = tuple(frozenset((effect["name"], effect["channel"]) for effect in one) for one in sets)
+    if unknown := sorted({name for one in answers for name, _ in one} - known):
+        raise ValueError(f"{unknown[0]!r} is no effect")
     return {
         "p_value": _probability(verdict["gap"]["p_value"]),
         "maximum": _probability(answer["maximum"]),
-        "verdict": _word(verdict["verdict"]),
-        "answers": tuple(frozenset((effect["name"], effect["channel"]) for effect in one) for one in sets),
+        "verdict": word,
+        "answers": answers,
         "pulls": _pulls(truth, verdict, answer, library),
         **_reduction(verdict["shrink"]),
         "places": tuple((place["frame"], place["L"], place["parity"]) for place in verdict["where"][:3]),
@@ -172,10 +183,14 @@ def _probability(value: Any) -> float:
     return value
 
 
-def _word(value: Any) -> str:
-    """Return one of the words for a verdict; ValueError for anything else."""
+def _word(value: Any, sets: Sequence[Sequence[Any]]) -> str:
+    """Return one of the words for a verdict; ValueError for anything else, or if its sets of effects are others."""
     if value not in get_args(Verdict):
         raise ValueError(f"{value!r} is not one of {', '.join(get_args(Verdict))}")
+    sizes = [len(one) for one in sets]
+    agrees = {"effect": sizes == [1], "mixture": len(sizes) == 1 and sizes[0] > 1, "degenerate": len(sizes) > 1}
+    if not agrees.get(value, not sizes):
+        raise ValueError(f"{value!r} with sets of {', '.join(map(str, sizes)) or 'no'} effects")
     return str(value)
 
 

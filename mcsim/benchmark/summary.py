@@ -139,6 +139,7 @@ def _naming(records: Sequence[Record]) -> list[Metric]:
         share(f"both of two effects, S/N >= {NAMED:g} each, |rho| <= {DISTINCT:g}", [r.right for r in clear]).within(
             "at least 80 %", 0.8
         ),
+        mean("sets of effects in a degenerate answer", [len(r.answers) for r in records if r.verdict == "degenerate"]),
     ]
 
 

@@ -196,6 +196,15 @@ def of_another_case(folder, case):
     return {"verdict.json": verdict | {"case": "case-004"}}
 
 
+def of_sets(word, *sets):
+    def verdict(folder, case):
+        found = json.loads((folder / "verdicts" / case / "verdict.json").read_text())
+        effects = [[{"name": name, "channel": "W1", "parameters": {}} for name in one] for one in sets]
+        return {"verdict.json": found | {"verdict": word, "effects": (effects or [[]])[0], "alternatives": effects[1:]}}
+
+    return verdict
+
+
 def changed(change):
     def answer(folder, case):
         found = json.loads((folder / "verdicts" / case / "answer.json").read_text())
@@ -214,6 +223,13 @@ def changed(change):
         changed(lambda found: {"evidence": "none"}),
         changed(lambda found: {"maximum": np.nan}),
         changed(lambda found: {"maximum": None}),
+        changed(lambda found: {"seal": 64 * "0"}),
+        of_sets("effect"),
+        of_sets("none", ["calibration"]),
+        of_sets("effect", ["calibration"], ["beam_width"]),
+        of_sets("mixture", ["calibration"]),
+        of_sets("degenerate", ["calibration"]),
+        of_sets("effect", ["no_such_effect"]),
     ],
 )
 def test_a_verdict_that_is_not_that_of_the_case_is_refused(challenge, tmp_path, damage):
@@ -226,6 +242,19 @@ def test_a_verdict_that_is_not_that_of_the_case_is_refused(challenge, tmp_path, 
         with refused("case-000"):
             score.score(folder, workers=0)
         path.write_text(text)
+
+
+def test_a_verdict_on_other_maps_is_no_answer(challenge):
+    """Of a challenge that was made anew over its verdicts, whose cases have the same names."""
+    folder, _ = challenge
+    run(folder, workers=0)
+    path = folder / "cases" / "case-002" / "SEAL"
+    text = path.read_text()
+    path.write_text(f"{64 * 'a'}  keys/case-002.json\n")
+    for task in (run, score.score):
+        with refused(folder / "verdicts" / "case-002", folder / "cases" / "case-002"):
+            task(folder, workers=0)
+    path.write_text(text)
 
 
 def test_a_verdict_without_other_effects_is_refused(challenge):
