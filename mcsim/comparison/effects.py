@@ -19,7 +19,7 @@ from mcsim.simulation.channels import table_of
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.support.arrays import Alm, Vector
-from mcsim.systematics import Effect, acts_through
+from mcsim.systematics import Effect, acts_through, described
 from mcsim.systematics.registry import basis_of, catalogue
 
 REDUNDANT = ("monopole_residual", "pixelization", "spectrum")
@@ -162,7 +162,7 @@ class EffectDifference(Difference):
 
     def found(self, value: Vector) -> str:
         """Return the effect of side A, which only some effects of side B take back exactly."""
-        return f"in side A: {self._effect(value).describe()}"
+        return f"in side A: {described(self._effect(value), self.run.map.frame)}"
 
     def parameters(self, value: Vector) -> dict[str, float | str]:
         return {k: v for k, v in self._effect(value).parameters().items() if isinstance(v, float | str)}

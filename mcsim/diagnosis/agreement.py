@@ -8,6 +8,7 @@ from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.result import Agreement
 from mcsim.errors import InputError
 from mcsim.stats.look_elsewhere import global_test
+from mcsim.systematics import described
 
 
 def agreement(known: DiagnosisContext) -> Agreement:
@@ -43,7 +44,7 @@ def agreement(known: DiagnosisContext) -> Agreement:
         ((_, theta, covariance),) = parts_of(known.candidates, (best,), fit)
         found_there = known.candidates[best].fitted(theta, covariance)
         # From responses to small steps: without an error, which a large one has beyond that of the noise.
-        nearest += f" (about {found_there.describe()})"
+        nearest += f" (about {described(found_there, known.frame)})"
     except InputError:
         pass
     accepted = tuple(name for name in source.effects if name in {one.name for one in known.candidates})

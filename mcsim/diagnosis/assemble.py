@@ -18,6 +18,7 @@ from mcsim.stats.detection import cosines, detectable, snr_needed, snr_to_separa
 from mcsim.stats.excess import HeldOut, excess_of
 from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Matrix, Vector
+from mcsim.systematics import described
 
 TELLING = 12  #: elements that are named where two sets differ
 
@@ -84,12 +85,14 @@ def _partial(context: DiagnosisContext, refined: Refined) -> Iterator[EffectResu
     found = refined.partial
     members = [refined.candidates[member] for member in found.members]
     t = found.templates[:, columns_of(context.candidates, found.members)]
-    return effects_of(context.candidates, found.members, with_priors(context.null, t, found.fit, members))
+    return effects_of(
+        context.candidates, found.members, with_priors(context.null, t, found.fit, members), context.frame
+    )
 
 
 def _set_of(context: DiagnosisContext, one: Explanation) -> EffectSet:
     """Return a set of effects with its amplitudes in parts of the data."""
-    effects = list(effects_of(context.candidates, one.members, one.fit))
+    effects = list(effects_of(context.candidates, one.members, one.fit, context.frame))
     fitted = [context.candidates[m].fitted(*part) for m, *part in parts_of(context.candidates, one.members, one.fit)]
     for place, own in enumerate(one.findings.comparisons):
         words = tuple(amplitudes(comparison, fitted[place]) for comparison in own)
@@ -121,8 +124,8 @@ def _nuisances(data: DataSet, refined: Refined) -> Iterator[NuisanceResult]:
     yield from known.results(context.analysis.nuisances, data.x)
 
 
-def effects_of(candidates: Sequence[Candidate], members: Sequence[int], fit: Fit) -> Iterator[EffectResult]:
-    """Yield the effects of a fit; raise InputError if no effect has such an amplitude."""
+def effects_of(candidates: Sequence[Candidate], members: Sequence[int], fit: Fit, frame: str) -> Iterator[EffectResult]:
+    """Yield the effects of a fit to maps in a frame; raise InputError if no effect has such an amplitude."""
     for member, theta, covariance in parts_of(candidates, members, fit):
         candidate = candidates[member]
         effect, sigma = candidate.fitted(theta, covariance), _sigma(candidate, theta, covariance, "amplitude")
@@ -138,7 +141,7 @@ def effects_of(candidates: Sequence[Candidate], members: Sequence[int], fit: Fit
                 for key, value in effect.parameters().items()
             },
             label=candidate.title,
-            words=effect.describe(sigma, errors),
+            words=described(effect, frame, sigma, errors),
             errors=errors,
         )
 
@@ -196,7 +199,8 @@ def _candidates(data: DataSet, refined: Refined, correlation: Matrix) -> Iterato
     for k, candidate in enumerate(candidates):
         columns = list(candidate.columns)
         try:
-            (alone,) = effects_of(candidates, (k,), with_priors(null, t[:, columns], found.singles[k], [candidate]))
+            fit = with_priors(null, t[:, columns], found.singles[k], [candidate])
+            (alone,) = effects_of(candidates, (k,), fit, data.context.frame)
             amplitude, sigma, words = alone.amplitude, alone.sigma, alone.words
         except InputError:
             amplitude, sigma, words = float("nan"), float("nan"), "no such amplitude"

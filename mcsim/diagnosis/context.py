@@ -52,6 +52,11 @@ class DiagnosisContext:
         return self.analysis.settings
 
     @property
+    def frame(self) -> str:
+        """Return the frame of the maps."""
+        return self.analysis.model.frame
+
+    @property
     def of_model(self) -> "DiagnosisContext":
         """Return what the model itself is tested with, whatever noise was found."""
         return self.without_noise or self

@@ -54,7 +54,8 @@ def says(structure: Structure, theta: Vector, covariance: Matrix, scene: Scene) 
     count = len(spans) if spans is not None and free else 1
     most = _most(theta, covariance, count)
     own = theta.reshape(count, -1)[most] if structure.stage == "beam" else theta
-    return ", ".join(filter(None, (_what(structure, own), _degrees(structure, spans, most), *_where(structure, scene))))
+    what = _what(structure, own, scene.frame)
+    return ", ".join(filter(None, (what, _degrees(structure, spans, most), *_where(structure, scene))))
 
 
 def _most(theta: Vector, covariance: Matrix, count: int) -> int:
@@ -63,7 +64,7 @@ def _most(theta: Vector, covariance: Matrix, count: int) -> int:
     return int(np.argmax([theta[rows] @ np.linalg.pinv(covariance[np.ix_(rows, rows)]) @ theta[rows] for rows in each]))
 
 
-def _what(structure: Structure, theta: Vector) -> str:
+def _what(structure: Structure, theta: Vector, frame: str) -> str:
     kind, number = structure.kind, structure.kind.rpartition(" ")[2]
     on = structure.acts_on.replace("sky and dipole", "sky and dipole alike")
     match structure.stage, structure.frame:
@@ -73,7 +74,8 @@ def _what(structure: Structure, theta: Vector) -> str:
             return f"is added to the signal, fixed to the sky, and {turns}"
         case "added", "sky" if kind.startswith("source"):
             lon_deg, lat_deg = map(float, kind.split()[1:])
-            return f"is a compact source, at longitude {lon_deg:.0f}° and latitude {lat_deg:.0f}°".replace("-", "−")
+            place = f"longitude {lon_deg:.0f}° and latitude {lat_deg:.0f}° ({frame})"
+            return f"is a compact source, at {place}".replace("-", "−")
         case "added", "sky":
             return f"is added to the signal, fixed to the sky ({_pattern(kind)})"
         case "added", "spacecraft" if kind == "lobe":

@@ -10,6 +10,7 @@ from mcsim.systematics.base import (
     Site,
     Wording,
     acts_through,
+    described,
 )
 from mcsim.systematics.hooks import HookError, if_possible
 from mcsim.systematics.parametrization import Parametrization
@@ -46,6 +47,7 @@ __all__ = [
     "called",
     "catalogue",
     "checked",
+    "described",
     "disturbing",
     "effects",
     "get",

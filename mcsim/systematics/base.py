@@ -350,6 +350,12 @@ class DirectedEffect(Effect):
         return f"towards longitude {self.lon_deg:.0f}°, latitude {self.lat_deg:.0f}°".replace("-", "−")
 
 
+def described(effect: Effect, frame: str, sigma: float = 0.0, errors: Mapping[str, float] | None = None) -> str:
+    """Return :meth:`Effect.describe`, with the frame of the maps behind a direction."""
+    words = effect.describe(sigma, errors)
+    return f"{words} ({frame})" if isinstance(effect, DirectedEffect) else words
+
+
 def acts_through(effect: Effect | type[Effect], *hooks: str) -> bool:
     """Return True if an effect, or the effects of a class, act through one of these hooks."""
     kind = effect if isinstance(effect, type) else type(effect)

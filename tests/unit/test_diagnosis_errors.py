@@ -31,7 +31,7 @@ def test_an_amplitude_is_no_more_errors_from_zero_than_chi2_falls(name: str) -> 
     covariance = 1e-6 * mixing @ mixing.T
     for theta in rng.multivariate_normal(np.zeros(size), covariance, 50):
         fall = float(theta @ np.linalg.solve(covariance, theta))
-        [found] = effects_of([candidate], [0], Fit(theta, covariance, 1000, fall, 1.0, 0.0, 1, 1.0))
+        [found] = effects_of([candidate], [0], Fit(theta, covariance, 1000, fall, 1.0, 0.0, 1, 1.0), "galactic")
         assert (found.amplitude / found.sigma) ** 2 <= fall * (1.0 + 1e-9)
 
 
@@ -42,7 +42,7 @@ def test_an_error_where_a_bound_fixes_a_parameter_is_that_along_the_bound() -> N
     unit = effect.parametrization.coordinates(effect(amplitude=1.0, quadrupole=-1.0))
     covariance = np.diag([1e-5, 1e-6]) ** 2
     theta = 2e-5 * unit - np.array([1.8e-5, 0.0])  # two errors off: the quadrupole would be -10
-    [found] = effects_of([candidate], [0], Fit(theta, covariance, 1000, 400.0, 1.0, 0.0, 1, 1.0))
+    [found] = effects_of([candidate], [0], Fit(theta, covariance, 1000, 400.0, 1.0, 0.0, 1, 1.0), "galactic")
     assert found.parameters["quadrupole"] == -1.0
     assert found.sigma == pytest.approx(float(unit @ np.linalg.solve(covariance, unit)) ** -0.5, rel=1e-9)
 
@@ -52,8 +52,10 @@ def test_a_dipole_of_which_one_component_is_hardly_known_has_that_in_its_error()
     candidate, _ = candidate_of("dipole_residual")
     for hardly, sigma in ((1.4, 1.4), (8.5, (3.2**2 + 8.5**2) ** 0.5 + (3.2**2 + 1.4**2) ** 0.5 - 2.0 * 3.2)):
         found_at = Fit(np.array([3.2, 1e-9, 1e-9]), np.diag([1.4, hardly, 1.4]) ** 2, 1000, 100.0, 1.0, 0.0, 1, 1.0)
-        [found] = effects_of([candidate], [0], found_at)
+        [found] = effects_of([candidate], [0], found_at, "galactic")
         assert found.amplitude == pytest.approx(3.2)
+        assert "longitude" in found.words
+        assert found.words.endswith("(galactic)")
         assert found.sigma == pytest.approx(sigma, rel=1e-6)
 
 
@@ -62,7 +64,7 @@ def test_the_error_of_a_whole_number_is_in_its_own_unit() -> None:
     effect = systematics.get("mapmaking_convergence")
     candidate, size = Candidate(effect, "W1", (0,)), 1.5**30
     found_at = Fit(np.array([size - 1.0]), np.array([[(0.1 * size) ** 2]]), 1000, 100.0, 1.0, 0.0, 1, 1.0)
-    [found] = effects_of([candidate], [0], found_at)
+    [found] = effects_of([candidate], [0], found_at, "galactic")
     assert found.amplitude == pytest.approx(30.0, abs=1e-6)
     assert found.sigma == pytest.approx(np.log(1.1 / 0.9) / (2.0 * np.log(1.5)), rel=1e-6)
 

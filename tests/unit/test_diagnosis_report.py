@@ -115,7 +115,7 @@ def bench(nearest_candidates: bool) -> SimpleNamespace:
         calibration=calibrate(model, model.whiten_groups(t, [one.columns for one in candidates]), draws=2000),
         templates=t,
     )
-    context.of_model = context
+    context.of_model, context.frame = context, fiducial.frame
     return context
 
 

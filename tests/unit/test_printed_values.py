@@ -61,7 +61,7 @@ def test_an_amplitude_at_the_edge_of_the_possible_has_an_error():
     kind = systematics.get("spectrum")
     errors = np.array([0.2, 0.02, 0.02, 0.02, 0.02, 0.02])
     less_than_nothing = SimpleNamespace(amplitudes=np.array([-1.1, 0, 0, 0, 0, 0]), covariance=np.diag(errors**2))
-    (found,) = effects_of([Candidate(kind, None, tuple(range(6)))], (0,), less_than_nothing)
+    (found,) = effects_of([Candidate(kind, None, tuple(range(6)))], (0,), less_than_nothing, "galactic")
     assert found.amplitude == pytest.approx(0.99)
     # That of the fit: the data are 5.5 errors from none, whatever is possible.
     assert found.sigma == pytest.approx(0.2, rel=1e-3)
@@ -71,7 +71,7 @@ def test_what_data_do_not_tell_is_no_part_of_an_error():
     kind = systematics.get("spectrum")
     errors = np.array([0.02, 0.02, 0.02, 0.02, 0.02, 0.4])
     fitted = SimpleNamespace(amplitudes=np.array([0.3, 0, 0, 0, 0, 1.0]), covariance=np.diag(errors**2))
-    (found,) = effects_of([Candidate(kind, None, tuple(range(6)))], (0,), fitted)
+    (found,) = effects_of([Candidate(kind, None, tuple(range(6)))], (0,), fitted, "galactic")
     assert found.amplitude == pytest.approx(0.3)
     assert found.sigma == pytest.approx(0.02)
 

@@ -474,6 +474,7 @@ def test_every_structure_has_words_and_a_picture():
         text = words.says(structure, theta, np.eye(structure.size), scene)
         assert text
         assert (structure.channel or "") in text
+        assert not structure.kind.startswith("source") or f"({scene.frame})" in text
         profile = words.profile(structure, theta, np.eye(structure.size), scene)
         assert bool(profile) == (words.profile_ranges(structure, scene) is not None)
     found = Reconstructed(
