@@ -272,9 +272,13 @@ def _with_covariance_of(measured: Measurement, path: str | Path, pair: str | Non
 
 
 def _unseen(design: Matrix, measured: Measurement) -> bool:
-    """Return True if the data do not constrain the imaginary part: its template is under 1e-6 of the real one."""
-    real, imaginary = np.linalg.norm(design / np.sqrt(np.diag(measured.covariance))[:, None], axis=0)
-    return bool(imaginary < 1e-6 * real)
+    """Return True if the data do not constrain the imaginary part: its template is a multiple of the real one.
+
+    It is zero for a beam along the scan, and in even parity as large as that for one at an angle.
+    """
+    real, imaginary = (design / np.sqrt(np.diag(measured.covariance))[:, None]).T
+    own = imaginary - real * (real @ imaginary) / max(float(real @ real), 1e-300)
+    return bool(np.linalg.norm(own) < 1e-6 * np.linalg.norm(real))
 
 
 def comparisons(fits: Sequence[Fit]) -> list[tuple[str, str, Comparison]]:

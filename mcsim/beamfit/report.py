@@ -128,6 +128,8 @@ def _model(one: Fit) -> list[str]:
                 angle = np.degrees(-0.5 * np.arctan2(one.other.parameters[1], one.other.parameters[0]))
                 turned += f", or by {number(angle)} deg, where chi2 is {one.other.chi2 - solution.chi2:.1f} higher"
             lines.append(f"    both turned by {turned}")
+        else:
+            lines.append("    these spectra do not say by how much both are turned; those of odd parity may (L2M0d1)")
     if one.each:
         each = one.to_dict()["realizations"]
         pulls = ", ".join(f"{name} {width:.3f}" for name, width in each["pull_width"].items())

@@ -187,6 +187,18 @@ def test_even_parity_alone_leaves_the_common_turn_open(shared):
     assert angles.common_deg is None
     assert angles.one_sided_deg == pytest.approx(30.0, abs=1e-4)
     assert "deg, one as configured" in report([found])
+    assert "L2M0d1" in report([found])
+
+
+def test_even_parity_alone_leaves_the_turn_of_a_beam_at_an_angle_open(shared):
+    """Both parts of the factor have the same template then: the fit had no solution."""
+    beam = Beam.elliptical(70.0, 60.0, angle_deg=20.0, lmax=LMAX)
+    turned = replace(shared, channels=(replace(shared.channels[0], beam=beam),))
+    found = fit(expected(turned, beam.blm), turned, "orientation")
+    assert found.model.parameters == ("real",)
+    np.testing.assert_allclose(found.solution.parameters, [1.0], rtol=1e-8)
+    three = fit(expected(turned, beam.blm, ("L2M0d0", "L2M0d1", "L2M0d2")), turned, "orientation")
+    np.testing.assert_allclose(three.solution.parameters, [1.0, 0.0], atol=1e-6)
 
 
 def test_a_factor_above_one_is_the_angle_zero(shared):
