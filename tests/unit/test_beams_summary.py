@@ -1,5 +1,7 @@
 """Figures and pictures of beams whose figures are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -96,6 +98,15 @@ def test_text_names_what_matters() -> None:
     ):
         assert fragment in text
     assert "note" not in text
+
+
+def test_text_warns_of_a_pedestal() -> None:
+    """A tenth of the peak everywhere makes the solid angle many times what it is."""
+    beam_map = drawn(30.0, 30.0, 0.0)
+    beam = Beam.elliptical(30.0, 30.0, lmax=500)
+    raised = replace(beam_map, image=beam_map.image + 0.5)
+    assert "at the edge of the map" not in format_summary(summarize(beam, beam_map))
+    assert "0.091 of the peak at the edge of the map" in format_summary(summarize(beam, raised))
 
 
 def test_text_warns_of_a_beam_cut_at_lmax() -> None:

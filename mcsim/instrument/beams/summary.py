@@ -12,6 +12,7 @@ from mcsim.instrument.beams.beammap import BeamMap, solid_angle_values
 DEFAULT_ELLS = (50, 100, 200, 300, 500, 700, 1000, 1500, 2000, 3000)
 BAND_LIMITED_WINDOW = 1e-5
 CIRCULAR_AXIS_RATIO = 1e-3
+PEDESTAL = 0.01  #: response about the edge of a map over its peak from which on it is told of
 _LISTED_ORDERS = 6
 _RADII = 400
 _AZIMUTHS = 180
@@ -34,6 +35,7 @@ class BeamSummary:
     negative_over_positive: float  #: integral of the negative response over that of the positive (a number >= 0)
     centroid_arcmin: tuple[float, float]  #: mean offset of the response from the centre along x and y, from b_11
     ells: tuple[int, ...]  #: degrees at which the coefficients are listed
+    edge_over_peak: float = 0.0  #: mean response about the edge of the map over its peak; 0 without a map
 
     @property
     def axis_ratio(self) -> float:
@@ -97,7 +99,16 @@ def summarize(beam: Beam, beam_map: BeamMap | None = None, ells: tuple[int, ...]
         negative_over_positive=float(abs(value[value < 0].sum()) / value[value > 0].sum()),
         centroid_arcmin=(float(offset.real) * _ARCMIN, -float(offset.imag) * _ARCMIN),
         ells=tuple(ell for ell in ells if ell <= beam.lmax),
+        edge_over_peak=0.0 if beam_map is None else _about_the_edge(beam_map) / peak,
     )
+
+
+def _about_the_edge(beam_map: BeamMap) -> float:
+    """Return the mean response of a map on a circle just within its edge, or within what is used of it."""
+    (rows, columns), (x, y) = beam_map.image.shape, beam_map.centre
+    inside = min(x, y, columns - 1 - x, rows - 1 - y) * beam_map.pixel_rad
+    phi = np.arange(_AZIMUTHS) * 2 * np.pi / _AZIMUTHS
+    return float(np.mean(beam_map.values(np.full(_AZIMUTHS, 0.97 * min(inside, beam_map.cut_rad)), phi)))
 
 
 def format_summary(summary: BeamSummary) -> str:
@@ -123,6 +134,11 @@ def format_summary(summary: BeamSummary) -> str:
         lines.append(
             f"note                 B_l is still {last:.2g} at lmax = {beam.lmax}: widths, solid "
             "angle and negative response are those of the beam cut there"
+        )
+    if abs(summary.edge_over_peak) > PEDESTAL:
+        lines.append(
+            f"note                 the response is still {summary.edge_over_peak:.2g} of the peak at the edge of the "
+            "map: solid angle and B_l are those of all that it holds; subtract what is no beam"
         )
     window, table = summary.window, summary.ratios
     orders = [m for m in range(1, min(beam.mmax, _LISTED_ORDERS) + 1) if np.any(table[m] > 0)]
