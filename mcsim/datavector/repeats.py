@@ -30,8 +30,8 @@ def check_distinct(rows: Matrix, source: Source, seed: int) -> None:
     first, again = (int(one) for one in pairs[np.lexsort((pairs[:, 0], pairs[:, 1]))[0]])
     remedy = "draw sky and noise of each from its whole seed" if source.count is None else "store each realization once"
     raise InputError(
-        f"{source.words(seed, first)} and {source.words(seed, again)} are the same; {len(rows)} realizations are asked "
-        f"for, and {distinct} of them {'differs' if distinct == 1 else 'differ'}: {remedy}."
+        f"{source.words(seed, first)} and {source.words(seed, again)} are the same, and of the first {len(rows)} "
+        f"{distinct} are different; {remedy}."
     )
 
 
