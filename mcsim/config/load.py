@@ -186,9 +186,10 @@ def _plain(source: Mapping[str, Any], where: str) -> dict[str, Any]:
             return value.item()
         if isinstance(value, Path):
             return str(value)
-        raise InputError(
-            f"{where}: the value {shown(str(value))} is a {type(value).__name__}; give a number, text, true or false."
-        )
+        remedy = "a number, text, true or false"
+        if isinstance(value, type) and hasattr(value, "amplitude"):
+            remedy = "the path of the .py file that has the effect's class"
+        raise InputError(f"{where}: the value {shown(str(value))} is a {type(value).__name__}; give {remedy}.")
 
     try:
         plain: dict[str, Any] = json.loads(json.dumps(dict(source), default=convert))

@@ -10,8 +10,9 @@ from mcsim.datavector.candidate import Candidate, columns_of, parts_of, scatters
 from mcsim.datavector.nuisances import NuisanceResult, Regression, with_priors
 from mcsim.diagnosis.consistency import amplitudes
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
+from mcsim.diagnosis.fitted import CandidateResult, EffectResult, EffectSet
 from mcsim.diagnosis.refine import Refined
-from mcsim.diagnosis.result import CandidateResult, DiagnosisResult, EffectResult, EffectSet
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Explanation
 from mcsim.errors import InputError
 from mcsim.stats.detection import cosines, detectable, snr_needed, snr_to_separate

@@ -1,7 +1,7 @@
 """The result of a diagnosis: one typed object that the report, the figures and the command line read."""
 
 import json
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -14,8 +14,9 @@ from mcsim.datavector.localisation import Place
 from mcsim.datavector.nuisances import NuisanceResult
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element
-from mcsim.diagnosis.consistency import Comparison, MapCheck
+from mcsim.diagnosis.consistency import Comparison
 from mcsim.diagnosis.control_result import Controls
+from mcsim.diagnosis.fitted import CandidateResult, EffectResult, EffectSet
 from mcsim.diagnosis.selection import Contrast, Verdict
 from mcsim.ensemble.store import write_dataset
 from mcsim.errors import InputError
@@ -27,94 +28,6 @@ from mcsim.support.folders import replacing, unreadable, user_path
 
 VERDICT, REPORT, STORE = "verdict.json", "report.html", "diagnosis.zarr"
 PLACES = 12  #: groups in the localisation table of ``verdict.json`` and of the report
-
-
-@dataclass(frozen=True)
-class EffectResult:
-    """One fitted effect: amplitude, standard error and parameters; ``label`` and ``words`` as people read them.
-
-    ``errors`` are those of fitted parameters. ``consistency`` are its amplitudes in parts of the data, over the fitted
-    one, and ``parts`` the same in words.
-    """
-
-    name: str
-    channel: str | None
-    amplitude: float
-    sigma: float
-    unit: str
-    parameters: dict[str, Any]
-    label: str
-    words: str
-    consistency: tuple[Comparison, ...] = ()
-    parts: tuple[str, ...] = ()
-    errors: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class EffectSet:
-    """A smallest set of effects that describes the data."""
-
-    #: effects, candidates: the effects, and their indices among the candidates
-    effects: tuple[EffectResult, ...]
-    candidates: tuple[int, ...]
-    #: coordinates, errors: fitted linear coordinates, those of one effect after the other, and standard errors
-    coordinates: tuple[float, ...]
-    errors: tuple[float, ...]
-    odds: float  #: posterior odds against the best set
-    #: pvalue, excess: of the residual that the fit leaves: p-value, and excess chi^2
-    pvalue: float
-    further: float  #: p-value of the most significant further candidate, with the look-elsewhere effect
-    excess: Measured
-    maps: tuple[MapCheck, ...] = ()  #: largest scales of the maps before and after the effects are taken out
-    #: p-value of the residual if neither an error of the responses nor the scatter that the effects add is tolerated;
-    #: None in results of earlier versions
-    pvalue_alone: float | None = None
-
-    @property
-    def label(self) -> str:
-        """Return the names of the effects."""
-        return " and ".join(effect.label for effect in self.effects)
-
-
-@dataclass(frozen=True)
-class CandidateResult:
-    """A candidate effect: its fit alone, the amplitude that would be detected, and the candidate most like it."""
-
-    #: name, channel, settings, unit, label, columns: of the effect; ``channel`` None: acts in all; and its columns of
-    #: the templates
-    name: str
-    channel: str | None
-    settings: dict[str, Any]
-    unit: str
-    label: str
-    columns: tuple[int, ...]
-    #: amplitude, sigma, words: fitted alone, NaN where no effect has such an amplitude; and as people read it
-    amplitude: float
-    sigma: float
-    words: str
-    #: delta_chi2, pvalue: unbiased fall of chi^2, and its p-value over all candidates (Bonferroni)
-    delta_chi2: float
-    pvalue: float
-    #: detectable, detectable_words: amplitude that is found with 90 % power at 5 % false alarms; None where the data
-    #: vector does not respond. fixed: other fitted parameters, which have these values there
-    detectable: float | None
-    detectable_words: str
-    fixed: dict[str, float]
-    #: similar, correlation: index of the other effect with the most similar response, None without one, and their
-    #: canonical correlation
-    similar: int | None
-    correlation: float
-    #: strength, separable, separable_words: amplitude over its error, and amplitude, at which the right one of the two
-    #: is chosen in 95 cases of 100
-    strength: float
-    separable: float
-    separable_words: str
-    largest: float = np.inf  #: largest absolute amplitude that the effect can have; infinite in earlier results
-
-    @property
-    def significance(self) -> float:
-        """Return the square root of the fall of chi^2."""
-        return float(np.sqrt(max(self.delta_chi2, 0.0)))
 
 
 @dataclass(frozen=True)
@@ -133,7 +46,7 @@ class Agreement:
     effects: tuple[str, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DiagnosisResult:
     """All that a diagnosis says: the verdict, and what it rests on.
 
@@ -235,6 +148,11 @@ class DiagnosisResult:
     nearest_pvalue: float | None = None
     orders: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        """Return case, verdict, p-value and sets of effects."""
+        sets = "; or ".join(one.label for one in self.sets)
+        return f"<DiagnosisResult {self.case}: {self.kind}, p = {self.test.pvalue:.2g}{sets and f', {sets}'}>"
+
     @property
     def verdict(self) -> dict[str, Any]:
         """Return ``verdict.json`` as a dictionary."""
@@ -261,7 +179,7 @@ class DiagnosisResult:
         return np.asarray((self.data - self.mean) / self.standard_deviation)
 
     def prediction(self, index: int) -> Vector:
-        """Return the change of every element by a set of effects over the scatter, shape (p,)."""
+        """Return the change of every element by a set of effects, ``sets[index]``, over the scatter, shape (p,)."""
         one = self.sets[index]
         columns = [column for member in one.candidates for column in self.candidates[member].columns]
         return np.asarray(self.templates[:, columns] @ np.array(one.coordinates) / self.standard_deviation)
@@ -321,7 +239,7 @@ class DiagnosisResult:
         """
         rest = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
         values: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
-        values |= {name: [getattr(one, name) for one in self.candidates] for name in _OF_CANDIDATES}
+        values |= {name: np.array([getattr(one, name) for one in self.candidates], float) for name in _OF_CANDIDATES}
         values |= {"z": self.z, "place_z": [p.z for p in self.places], "place_p": [p.p for p in self.places]}
         described = {**_DERIVED, **_ARRAYS, **_OF_CANDIDATES}
         variables = {
@@ -333,7 +251,9 @@ class DiagnosisResult:
             "element": ("element", [one.name for one in self.elements], "element of the data vector"),
             "description": ("element", [one.words for one in self.elements], "what an element measures"),
             "element_unit": ("element", [one.unit for one in self.elements], "unit of an element"),
-            "candidate": ("candidate", [one.label for one in self.candidates], "candidate effect"),
+            "candidate": ("candidate", effects := [one.label for one in self.candidates], "candidate effect"),
+            "other": ("other", effects, "the other candidate effect"),
+            "column": ("column", [x for one in self.candidates for x in one.components], "component of a candidate"),
             "unit": ("candidate", [one.unit for one in self.candidates], "unit of the amplitude of a candidate"),
             "place": ("place", [one.element.words for one in self.places], "element of a group that departs most"),
         }
@@ -392,7 +312,7 @@ class DiagnosisResult:
 _OF_ELEMENT = "see element_unit"
 _ARRAYS: dict[str, tuple[str | tuple[str, ...], str, str]] = {
     "data": ("element", _OF_ELEMENT, "data vector"),
-    "mean": ("element", _OF_ELEMENT, "mean of the simulations, corrected by the time-ordered reference"),
+    "mean": ("element", _OF_ELEMENT, "mean of the model, as that of its samples where these are known"),
     "standard_deviation": ("element", _OF_ELEMENT, "scatter of the simulations"),
     "templates": (("element", "column"), f"{_OF_ELEMENT}; per unit coordinate", "response per unit coordinate"),
     "correlation": (("candidate", "other"), "1", "canonical correlation of responses"),
@@ -405,6 +325,8 @@ _OF_CANDIDATES: dict[str, tuple[str | tuple[str, ...], str, str]] = {
     "amplitude": ("candidate", "see unit", "fitted alone"),
     "sigma": ("candidate", "see unit", "standard error"),
     "delta_chi2": ("candidate", "1", "fall of chi^2"),
+    "pvalue": ("candidate", "1", "p-value of the fall of chi^2 over all candidates (Bonferroni)"),
+    "detectable": ("candidate", "see unit", "amplitude found with 90 % power at 5 % false alarms; NaN: no response"),
 }
 _DERIVED: dict[str, tuple[str | tuple[str, ...], str, str]] = {
     "z": ("element", "1", "data less mean, over scatter"),

@@ -5,7 +5,8 @@ from pathlib import Path
 
 from mcsim.datavector.localisation import Place
 from mcsim.datavector.nuisances import NuisanceResult
-from mcsim.diagnosis.result import Agreement, DiagnosisResult, EffectResult, EffectSet
+from mcsim.diagnosis.fitted import EffectResult, EffectSet
+from mcsim.diagnosis.result import Agreement, DiagnosisResult
 from mcsim.diagnosis.selection import Contrast
 from mcsim.stats.excess import HeldOut, Measured
 from mcsim.support.numbers import measured, number, p_equals

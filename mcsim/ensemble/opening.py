@@ -1,5 +1,6 @@
 """Lazy opening of stored ensembles with xarray."""
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,7 +66,7 @@ def open_summary(path: str | Path) -> "xr.Dataset":
         are means over a bin, ``bin_first`` to ``bin_last``, of the raw coefficients times ``bin_factor`` (mode, ell),
         which makes them l(l+1)/2pi A-hat, uK^2; ``biposh_binned_covariance`` (pair, mode, bin, bin_2) is that of one
         realization, uK^4. Errors and deviations of complex numbers are those of both parts together,
-        sqrt(re^2 + im^2).
+        sqrt(re^2 + im^2). A warning says that realizations are finished that it does not have.
 
     Raises
     ------
@@ -89,7 +90,15 @@ def open_summary(path: str | Path) -> "xr.Dataset":
         raise InputError(
             f"{path} has no summary, because no run on it has ended yet; continue it with mcsim run --resume."
         )
-    return _opened(target, "summary")
+    found = _opened(target, "summary")
+    finished = int(store.done(target).sum())
+    if (count := int(found["count"])) < finished:
+        warnings.warn(
+            f"the summary of {path} is of {count} realizations, and {finished} are finished since; mcsim run --resume "
+            "makes it of all.",
+            stacklevel=2,
+        )
+    return found
 
 
 def _opened(path: Path, group: str | None) -> "xr.Dataset":

@@ -16,6 +16,11 @@ from mcsim.stats.streaming import Sums
 from mcsim.stats.wishart import inverse_variance
 from mcsim.support.arrays import divided
 
+FACTOR = (
+    "l(l+1)/2pi times sqrt(2 L + 1) / (sqrt((2 l1 + 1)(2 l2 + 1)) C^{L0}_{l1 0 l2 0}), Bennett's; of odd parity times "
+    "(-1)^l2 ((2 l1 + 1)(2 l2 + 1))^(-1/4)"
+)
+
 if TYPE_CHECKING:
     import xarray as xr
 
@@ -165,14 +170,15 @@ def dataset(layout: Layout, sums: Sums, attributes: Mapping[str, Any]) -> "xr.Da
         elif raw != name:
             meaning = f"l(l+1)/2pi A, mean over the bin, {meaning}"
         deviation = streaming.standard_deviation(sums, name)
-        error, of_mean = deviation / np.sqrt(sums.count), "standard error of the mean"
+        both = "" if raw.startswith("cl") else " of a complex number, sqrt(re^2 + im^2)"
+        error, of_mean = deviation / np.sqrt(sums.count), f"standard error of the mean{both}"
         if raw.startswith(QML):
             error = np.hypot(error, of_normalisation(layout, sums, attributes.get("probes", 0), kind))
             of_mean += ", that of the normalisation by random probes included"
         for suffix, array, text in (
             ("mean", sums.mean[name], "mean"),
             ("standard_error", error, of_mean),
-            ("standard_deviation", deviation, "standard deviation of one realization"),
+            ("standard_deviation", deviation, f"standard deviation of one realization{both}"),
         ):
             variables[f"{name}_{suffix}"] = (dims, array, {"units": "uK^2", "long_name": f"{meaning}: {text}"})
         for part, array in _errors_of_parts(layout, sums, name, error).items():
@@ -182,7 +188,7 @@ def dataset(layout: Layout, sums: Sums, attributes: Mapping[str, Any]) -> "xr.Da
             text = f"{meaning}: covariance of one realization between bins"
             array = streaming.covariance(sums, name)
             variables[f"{name}_covariance"] = ((*dims, "bin_2"), array, {"units": "uK^4", "long_name": text})
-    own = {"units": "1", "long_name": "factor from raw coefficients to binned ones"}
+    own = {"units": "1", "long_name": f"factor from raw coefficients to binned ones: {FACTOR}"}
     variables["bin_factor"] = (("mode", "ell"), _factors(layout.modes, layout.lmax).copy(), own)
     variables["count"] = ((), np.array(sums.count), {"units": "1", "long_name": "number of realizations"})
     coordinates = {k: v for k, v in layout.coordinates().items() if k not in ("realization", "map_name")}

@@ -70,7 +70,7 @@ class EffectLimit:
         return number(value) + ("*" if self.amplitude_max < value < np.inf else "")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Limits:
     """Hold the limit of every effect, and the Fisher matrix behind it.
 
@@ -106,6 +106,10 @@ class Limits:
     method: str
     settings: LimitSettings
     no_dipole: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        """Return the model and the table of :meth:`lines`."""
+        return "\n".join([f"<Limits of {self.model}>", *self.lines()])
 
     @property
     def impossible(self) -> bool:

@@ -16,7 +16,7 @@ import pytest
 import xarray as xr
 from distributed import Client
 
-from mcsim import config, open_ensemble
+from mcsim import config, open_ensemble, open_summary
 from mcsim.ensemble import opening, prediction, runner, store, summary
 from mcsim.ensemble.describe import describe
 from mcsim.ensemble.repair import verify
@@ -141,6 +141,20 @@ def test_a_store_of_one_realization_is_extended_and_whole(client: Client, tmp_pa
     assert verify(path).intact
     with open_ensemble(path) as found:
         assert found["realization"].values.tolist() == [0, 1, 2]
+
+
+def test_a_summary_without_the_latest_realizations_says_so(small_store: Path, client: Client, tmp_path: Path) -> None:
+    """What an extension leaves that was interrupted."""
+    path, before = tmp_path / "half.zarr", tmp_path / "before"
+    runner.run(table(**ensemble(3)), path, workers=client)
+    shutil.copytree(path / "summary", before)
+    runner.run(table(**ensemble(10)), path, workers=client)
+    shutil.rmtree(path / "summary")
+    before.rename(path / "summary")
+    with pytest.warns(UserWarning, match="of 3 realizations, and 10 are finished"):
+        assert int(open_summary(path)["count"]) == 3
+    runner.run(table(**ensemble(10)), path, workers=client, resume=True)
+    assert int(open_summary(path)["count"]) == 10
 
 
 def test_an_extension_that_ends_before_the_store_has_grown_is_completed(

@@ -114,3 +114,18 @@ def test_tables_that_hold_no_coefficients_say_what_they_lack(tmp_path, columns) 
         Beam.from_blm(path, 5)
     assert "list index" not in str(refusal.value)
     assert ({1: "1 of 3", 2: "2 of 3"}.get(columns, "")) in str(refusal.value)
+
+
+@pytest.mark.parametrize("polarised", [0.0, 1.0])
+def test_coefficients_of_a_polarised_beam_are_no_orders_of_one(polarised) -> None:
+    """Three rows of healpy's order have the shape of [m, l] for m up to 2, and gave a circular beam."""
+    lmax = 40
+    own = Beam.elliptical(900.0, 600.0, lmax=lmax, mmax=4)
+    temperature = np.zeros(healpy.Alm.getsize(lmax), dtype=complex)
+    ell, m = healpy.Alm.getlm(lmax)
+    inside = m <= own.mmax
+    temperature[inside] = own.blm[m[inside], ell[inside]]
+    other = polarised * np.where((ell < 2) | (m == 1), 0.0, temperature)
+    with refused("3, 861", "l = 40"):
+        Beam.from_blm(np.stack([temperature, other, -1j * other]))
+    assert Beam.from_blm(temperature).mmax == own.mmax

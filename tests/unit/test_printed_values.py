@@ -10,7 +10,11 @@ from mcsim import systematics
 from mcsim.datavector.candidate import Candidate
 from mcsim.diagnosis import words
 from mcsim.diagnosis.assemble import effects_of
+from mcsim.diagnosis.fitted import CandidateResult
+from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.ensemble.describe import describe_prediction
+from mcsim.information.result import Limits
+from mcsim.instrument.beams import Beam
 from mcsim.support.numbers import duration, measured, number, probability
 
 
@@ -110,3 +114,21 @@ def test_coefficients_that_are_real_are_printed_without_what_rounding_leaves():
     assert describe_prediction(expected) == plain
     swapped = expected.assign_coords(d=expected.d + 1)
     assert "j" in describe_prediction(swapped)
+
+
+def test_results_print_as_a_line() -> None:
+    """A diagnosis was 120,000 characters, most of them arrays."""
+    sets = (SimpleNamespace(label="ellipticity of W1"), SimpleNamespace(label="coma of W1"))
+    found = SimpleNamespace(case="first", kind="degenerate", test=SimpleNamespace(pvalue=1.234e-5), sets=sets)
+    expected = "<DiagnosisResult first: degenerate, p = 1.2e-05, ellipticity of W1; or coma of W1>"
+    assert DiagnosisResult.__repr__(found) == expected
+    assert repr(Beam.gaussian(60.0, 100)) == "<Beam: lmax = 100, mmax = 0>"
+    limits = SimpleNamespace(model="small", lines=lambda: ["effect  sigma", "gain  0.01"])
+    assert Limits.__repr__(limits).splitlines() == ["<Limits of small>", "effect  sigma", "gain  0.01"]
+
+
+@pytest.mark.parametrize(
+    ("columns", "expected"), [((4,), ["gain"]), ((1, 2), ["gain, component 1", "gain, component 2"])]
+)
+def test_columns_of_a_candidate_have_names(columns, expected) -> None:
+    assert CandidateResult.components.fget(SimpleNamespace(label="gain", columns=columns)) == expected

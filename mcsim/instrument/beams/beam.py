@@ -24,7 +24,7 @@ LEAST_NORMALISED = 1e-6  #: largest departure of B_0 from 1: that of coefficient
 DEFAULT_LMAX = 2048  #: largest degree of a beam where none is asked for
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Beam:
     """Harmonic coefficients of a beam that points at the pole.
 
@@ -57,6 +57,10 @@ class Beam:
     blm: NDArray[np.complex128]
     neglected_power: float = 0.0
     integral: float = 1.0
+
+    def __repr__(self) -> str:
+        """Return the highest degree and order."""
+        return f"<Beam: lmax = {self.lmax}, mmax = {self.mmax}>"
 
     def __post_init__(self) -> None:
         """Raise InputError unless finite coefficients stand at ``blm[m, l]``, zero for l < m."""

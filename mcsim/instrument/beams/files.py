@@ -65,6 +65,13 @@ def _of_array(array: NDArray) -> NDArray[np.complex128]:
             f"an array of b_lm has the shape {array.shape}: give healpy's order with every m up to lmax, or [m, l] of "
             "shape (mmax + 1, lmax + 1)"
         )
+    own = alm_.lmax_of(array.shape[1]) if len(array) == 3 else None
+    # E and B begin at l = 2, and with m = 1 at place own + 1 of healpy's order.
+    if own is not None and own > 1 and not np.any(array[1:, [0, 1, own + 1]]):
+        raise InputError(
+            f"an array of b_lm has the shape {array.shape}, that of T, E and B of a beam up to l = {own}: give its "
+            "first row, the temperature beam"
+        )
     return np.triu(array).astype(np.complex128)
 
 
