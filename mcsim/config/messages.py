@@ -1,6 +1,7 @@
 """Messages of failed checks of the schema: one sentence with file, key, value, limit, remedy."""
 
 import difflib
+import functools
 import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -8,7 +9,7 @@ from dataclasses import fields
 from typing import Any
 
 from pydantic import ValidationError
-from pydantic_core import ErrorDetails
+from pydantic_core import ArgsKwargs, ErrorDetails
 
 from mcsim.config import beams, noise, preparation, schema
 from mcsim.errors import InputError
@@ -22,6 +23,7 @@ _TABLES: dict[tuple[str, ...], type] = {
     ("biposh",): schema.Biposh,
     ("ensemble",): schema.Ensemble,
     ("compute",): schema.Compute,
+    ("effect",): schema.Effect,
     ("nuisance",): schema.Nuisance,
     **{("preparation", step.kind): step for step in preparation.STEPS},
     **{
@@ -100,13 +102,13 @@ def _text(item: ErrorDetails, key: str, tables: tuple[str, ...]) -> str:
     stated = f"{key} = {shown(item['input'])}" if key else "the configuration"
     if kind == "unexpected_keyword_argument":
         known = [_TOML_NAMES.get(field.name, field.name) for field in fields(_TABLES[tables])]
-        hint = _closest(str(item["loc"][-1]), known)
+        hint = _closest(str(item["loc"][-1]), known, headers=not tables)
         return f"the key {key} is unknown{hint}; remove it or correct it to one of {', '.join(known)}"
     if kind == "missing":
         return f"the key {key} is missing; add it"
     if kind == "value_error":
         reason = str(context["error"])
-        if isinstance(item["input"], dict | schema.RunConfig):
+        if isinstance(item["input"], dict | schema.RunConfig | ArgsKwargs):
             return f"{key}: {reason}" if key else reason
         return f"{stated} {reason}"
     if key == "schema":
@@ -154,11 +156,13 @@ def _quoted(text: str) -> list[str]:
     return text.split("'")[1::2]
 
 
-def _closest(word: str, known: Iterable[str]) -> str:
+def _closest(word: str, known: Iterable[str], headers: bool = False) -> str:
+    """Return a question for the nearest word; ``headers``: tables that repeat have theirs."""
     names = list(known)
     same = [name for name in names if name.lower() == word.lower()]  # L_max for l_max, not lmax
     match = same or difflib.get_close_matches(word, names, n=1)
-    return f" (did you mean {_REPEATED.get(match[0], match[0])}?)" if match else ""
+    meant = [_REPEATED.get(name, name) if headers else name for name in match]
+    return f" (did you mean {meant[0]}?)" if meant else ""
 
 
 def _locate(loc: tuple[int | str, ...], plain: Any) -> tuple[str, tuple[str, ...]]:
@@ -184,3 +188,26 @@ def _locate(loc: tuple[int | str, ...], plain: Any) -> tuple[str, tuple[str, ...
         here = here.get(part) if isinstance(here, dict) else None
     tables = tuple(str(part) for part in loc[:-1] if not isinstance(part, int))
     return key, ("channel", "noise", *tables[3:]) if tables[:2] == ("channel", "split_noise") else tables
+
+
+def _in_words(table: type, path: tuple[str, ...]) -> None:
+    """Let a table that is built in Python, or replaced there, be refused in the words that one of a file is."""
+    made = vars(table)["__init__"]
+    start = path[: max(len(path) - 1, 1)]
+
+    @functools.wraps(made)
+    def init(self: Any, *args: Any, **given: Any) -> None:
+        try:
+            made(self, *args, **given)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            key = ".".join([*start, *(part for part in first["loc"] if isinstance(part, str))])
+            raise InputError(f"{_text(first, key, path)}.") from None
+
+    type.__setattr__(table, "__init__", init)
+
+
+for _table, _path in {
+    table: path for path, table in reversed([*_TABLES.items(), (("effect",), schema.Effect)])
+}.items():
+    _in_words(_table, _path)

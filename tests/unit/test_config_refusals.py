@@ -1,5 +1,7 @@
 """The configuration: one sentence for everything that it refuses."""
 
+from dataclasses import replace
+
 import pytest
 
 from mcsim import config
@@ -220,3 +222,21 @@ def test_a_key_that_differs_in_case_alone_is_the_one_that_is_meant(plain, folder
     with refused("biposh.l_max") as found:
         config.load(changed(plain, "biposh.l_max", 2))
     assert "(did you mean L_max?)" in str(found.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda run: replace(run.map, nside=15), ("map.nside = 15", "16")),
+        (lambda run: replace(run.ensemble, realizations=-4), ("ensemble.realizations = -4", "1")),
+        (lambda run: config.Noise(sigma0_uk=-5.0), ("channel.noise.sigma0_uk = -5.0", "0")),
+        (lambda run: config.Map(), ("map", "nside")),
+        (lambda run: config.Effect(name="beam_width", chanel="V"), ("effect.chanel", "channel")),
+        (lambda run: replace(run, biposh=replace(run.biposh, filter="inverse_covariance")), ("biposh.filter",)),
+        (lambda run: replace(run, name=3), ("name = 3",)),
+    ],
+)
+def test_what_python_builds_is_refused_as_a_file_is(make, named):
+    """It was an error of the library that checks, with a link to its pages."""
+    with refused(*named):
+        make(config.load("tiny"))
