@@ -196,7 +196,8 @@ def _taken(run: config.RunConfig, maps: Sequence[Map] | Mapping[str, Map]) -> di
     if isinstance(maps, Mapping):
         lacking = [name for name in names if name not in maps]
         if lacking:
-            raise InputError(f"the maps lack {lacking[0]}; the model has {', '.join(names)}.")
+            given = ", ".join(map(str, maps)) or "none"
+            raise InputError(f"the maps lack {lacking[0]}; the model has {', '.join(names)}, and given are {given}.")
         _warn_of_others(str(name) for name in maps if name not in names)
         maps = [maps[name] for name in names]
     if not isinstance(maps, Sequence | np.ndarray):

@@ -36,7 +36,10 @@ class Weighted(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BeamModes:
-    """Estimate b_ls / b_l0, s = 1 ... ``orders``, in bins of ``width`` degrees.
+    """Estimate b_ls / b_l0, s = 1 ... ``orders``, in bins of ``width`` degrees, the first of which begins at l = 0.
+
+    Real vectors hold the real parts of what exists, order by order and bin by bin, and then the imaginary parts: K
+    numbers, of q in units of 1 / beta, which has none.
 
     Raises
     ------
@@ -104,12 +107,12 @@ class BeamModes:
         return np.asarray(found[:, self._known].ravel())
 
     def score(self, map_uk: Map) -> Vector:
-        """Return q of a map, whose mean for a circular beam is the mean field."""
+        """Return q, shape (K,), of a map in uK, shape (npix,); its mean for a circular beam is the mean field."""
         one = self.weighted(map_uk)
         return self.products(one, one)
 
     def fisher(self, probes: Sequence[Weighted]) -> Matrix:
-        """Return F from random maps of the filter's covariance (:meth:`probe`), by all their pairs."""
+        """Return F, shape (K, K), from all pairs of two or more random maps that :meth:`probe` makes."""
         total, pairs = np.zeros((2 * int(self._known.sum()),) * 2), 0
         for i, one in enumerate(probes):
             for other in probes[:i]:
@@ -125,7 +128,7 @@ class BeamModes:
         return self.weighted(self.filter.inverse.draw(f"beam modes/{self.filter.name}", number)[0])
 
     def spectra(self, numbers: Vector) -> NDArray[np.complex128]:
-        """Return real numbers as beta, shape (order, bin), NaN where an order does not exist."""
+        """Return K real numbers as beta, shape (orders, bins), NaN where an order does not exist."""
         real, imaginary = np.split(numbers, 2)
         found = np.full(self._known.shape, complex(np.nan, np.nan))
         found[self._known] = real + 1j * imaginary
