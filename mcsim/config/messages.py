@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import fields
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 from pydantic_core import ArgsKwargs, ErrorDetails
 
@@ -68,10 +69,15 @@ _TYPES = ("float", "int", "str", "bool")
 
 def sentence(error: ValidationError, plain: Any, where: str) -> str:
     """Return one sentence on the first error; unknown keys come first because they explain missing ones."""
-    details = error.errors(include_url=False)
-    first = next((item for item in details if item["type"] == "unexpected_keyword_argument"), details[0])
+    first = _first(error)
     key, tables = _locate(first["loc"], plain)
     return f"{where}: {_text(first, key, tables)}."
+
+
+def _first(error: ValidationError) -> ErrorDetails:
+    details = error.errors(include_url=False)
+    telling = ("unexpected_keyword_argument", "unexpected_positional_argument")
+    return next((item for item in details if item["type"] in telling), details[0])
 
 
 def read_from(run: schema.RunConfig, file: str) -> schema.RunConfig:
@@ -104,6 +110,8 @@ def _text(item: ErrorDetails, key: str, tables: tuple[str, ...]) -> str:
         known = [_TOML_NAMES.get(field.name, field.name) for field in fields(_TABLES[tables])]
         hint = _closest(str(item["loc"][-1]), known, headers=not tables)
         return f"the key {key} is unknown{hint}; remove it or correct it to one of {', '.join(known)}"
+    if kind == "unexpected_positional_argument":
+        return f"{key or 'a run'} is given {shown(item['input'])} without its key; name every value by its key"
     if kind == "missing":
         return f"the key {key} is missing; add it"
     if kind == "value_error":
@@ -145,7 +153,7 @@ def label(table: Any, number: int) -> str:
 def shown(value: Any) -> str:
     """Return a value as TOML writes it, cut to a readable length."""
     try:
-        text = json.dumps(value, default=str)
+        text = json.dumps(value.item() if isinstance(value, np.generic) else value, default=str)
     except (ValueError, TypeError):
         text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
@@ -200,8 +208,9 @@ def _in_words(table: type, path: tuple[str, ...]) -> None:
         try:
             made(self, *args, **given)
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            key = ".".join([*start, *(part for part in first["loc"] if isinstance(part, str))])
+            first = _first(error)
+            parts = (part for part in first["loc"] if isinstance(part, str) and part not in _TYPES)
+            key = ".".join([*start, *parts])
             raise InputError(f"{_text(first, key, path)}.") from None
 
     type.__setattr__(table, "__init__", init)

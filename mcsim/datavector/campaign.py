@@ -374,11 +374,12 @@ def _nuisances(analysis: Analysis, count: int) -> Rows | None:
     return np.stack([draws(analysis.nuisances, _COVARIANCE, realization)[0] for realization in range(count)])
 
 
-def after_jobs(analysis: Analysis, found: Sequence[config.Effect], skies: int | None = None) -> list[Job]:
+def after_jobs(analysis: Analysis, found: Sequence[config.Effect], skies: range | int | None = None) -> list[Job]:
     """List two jobs that simulate the model with effects, over the skies with which responses are measured."""
-    total = analysis.settings.noisy_skies if skies is None else skies
+    if not isinstance(skies, range):
+        skies = range(analysis.settings.noisy_skies if skies is None else skies)
     job = replace(_with(analysis, found), source=analysis.source_of(found))
-    return in_tasks(job, range(total), -(-total // 2))
+    return in_tasks(job, skies, -(-len(skies) // 2))
 
 
 def constrained_jobs(

@@ -1,15 +1,20 @@
 """Measured spectra as a data set: a table of binned BipoSH coefficients, or C_l, against simulations of the model."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from mcsim import config
+from mcsim.datavector.campaign import after_jobs
 from mcsim.datavector.localisation import Place, places
 from mcsim.datavector.spectra_table import Spectra
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.output import DIGEST, digest
 from mcsim.errors import InputError
 from mcsim.support.arrays import Matrix, Vector
+
+MORE = 8  #: times as many skies as otherwise over which a response is averaged at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +29,11 @@ class MeasuredSpectra(DataSet[Spectra]):
     table say nothing of correlations. They are only compared with it, in a note. The reduction is fitted to every other
     bin and tested with the others. What the former predict of the latter, where simulations find them correlated, is
     subtracted; the correlation that remains is stated. Rotated to other frames are only spectra with every M, real and
-    imaginary.
+    imaginary. A mean of many skies may have smaller errors than a response over a few: this is averaged over twice as
+    many, and again, until it has none to speak of beside them, ``settled_sigma``.
     """
+
+    _without: dict[range, Matrix] = field(default_factory=dict, init=False, repr=False)  # effects, by their skies
 
     def __post_init__(self) -> None:
         """Refuse numbers that cannot be in the unit, or the mean of as many skies, as the table says."""
@@ -58,6 +66,29 @@ class MeasuredSpectra(DataSet[Spectra]):
     def x(self) -> Vector:
         """Return the values of the table, shape (p,)."""
         return self.data.value
+
+    def pair_extended(self, found: Sequence[config.Effect], skies: int) -> tuple[Matrix, Matrix]:
+        """Return data vectors of skies without and with effects, of as many as it takes for their mean difference."""
+        before, after = super().pair_extended(found, skies)
+        analysis, kinds = self.context.analysis, dict(self.context.analysis.library)
+        drawn = any(kinds[one.name].parametrization.stochastic for one in found)  # its scatter is its own
+        most = MORE * len(after)
+        while not drawn and len(after) < most and not self._is_known(after - before):
+            more = range(len(after), min(2 * len(after), most))
+            if more not in self._without:
+                self._without[more] = np.concatenate(self.ask(after_jobs(analysis, (), more)))
+            before = np.concatenate([before, self._without[more]])
+            after = np.concatenate([after, *self.ask(after_jobs(analysis, found, more))])
+        return before, after
+
+    def _is_known(self, changes: Matrix) -> bool:
+        """Return True if the mean of changes, shape (skies, p), is known well beside the errors of the data."""
+        null, settings = self.context.null, self.context.settings
+        white = np.sqrt(null.hartlap_factor) * null.whiten_templates(changes.T)
+        mean, variance = white.mean(axis=1), white.var(axis=1, ddof=1).sum() / len(changes)
+        along = float(np.std(mean @ white, ddof=1)) / max(float(np.linalg.norm(mean)), 1e-300)
+        known = along <= settings.settled_sigma * np.sqrt(len(changes))
+        return bool(known and variance <= settings.settled_sigma * np.sqrt(2.0 * null.dimension))
 
     def notes(self) -> list[str]:
         """Return a sentence if the table's errors are far from the scatter of the simulations."""

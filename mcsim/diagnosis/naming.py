@@ -24,6 +24,8 @@ def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[
     Where another set agrees, one that parts contradict is not left out before it is ``odds_cut`` times less probable.
     What is left has to be as probable as ``named_probability`` asks for without what was left out.
     """
+    if not found.explanations:
+        return found, []
     context, slices = data.context, slices_of(data)
     settings, candidates = context.settings, context.candidates
     frequencies = {channel.frequency_ghz if channel.foregrounds else None for channel in context.run.channels}
@@ -61,8 +63,9 @@ def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[
     left = replace(found.of(kept), probability=probability, contradicted=tuple(refused))
     if kept and probability < settings.named_probability:
         sets = "; and ".join(_title(candidates, one) for one in left.explanations)
-        sentences.append(f"No part contradicts {sets}, but that is not named with a probability of {probability:.2g}.")
-        left = left.unexplained()
+        why = f"beside what fell away the probability of all that is left is {probability:.2g}"
+        sentences.append(f"The data vector fits {sets}, which is not named: {why}.")
+        left = replace(left.unexplained(), contradicted=(*refused, *left.explanations))
     return left, sentences
 
 

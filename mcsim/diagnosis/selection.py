@@ -79,7 +79,7 @@ class Attribution:
     #: charged for
     probability: float = 1.0
     faint: bool = False  #: True if that is too small for a name
-    contradicted: tuple[Explanation, ...] = ()  #: sets that parts of the data contradict
+    contradicted: tuple[Explanation, ...] = ()  #: sets that parts of the data contradict, or leave improbable
 
     def if_named(self, settings: DiagnosisSettings) -> "Attribution":
         """Return the attribution without its explanations if these are less probable than all else together."""

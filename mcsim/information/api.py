@@ -308,11 +308,10 @@ def _candidates(
 def _of_prior(variants: Sequence[Candidate]) -> list[Candidate]:
     """Return a nuisance in the coordinates of its prior: with the effect's own parameters, none of them fitted.
 
-    One that has no parameters of its own, as what acts in one split, is there with those of every variant.
+    One that acts in single splits is there in each of them.
     """
-    usual = vars(variants[0].effect()).items()
-    own = [one for one in variants if one.settings.items() <= usual][:1] or variants
-    columns = tuple(range(len(own[0].effect.parametrization.basis())))
+    columns = tuple(range(len(variants[0].effect.parametrization.basis())))
+    own = variants if "split" in variants[0].settings else [replace(variants[0], settings={})]
     return [replace(one, columns=columns, fit=None) for one in own]
 
 

@@ -108,7 +108,8 @@ def _flaw(hook: str, found: Any, given: Sequence[Any]) -> str | None:
         return f"an array of shape {values.shape}, where {wanted} is needed"
     if values.dtype.kind not in ("c" if hook == "sky" else "fiu"):
         return f"values of type {values.dtype}"
-    if hook == "sky" and np.any(np.abs(values[: given[1].lmax + 1].imag) > ROUNDING * np.max(np.abs(values))):
+    zonal = next((one.lmax + 1 for one in given if hasattr(one, "lmax")), 0)
+    if hook == "sky" and np.any(np.abs(values[:zonal].imag) > ROUNDING * np.max(np.abs(values))):
         return "coefficients of m = 0 that are not real"
     return None
 

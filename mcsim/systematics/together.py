@@ -1,16 +1,20 @@
 """What the effects that act in a channel do together."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import rng
 from mcsim.support.arrays import Vector
 from mcsim.systematics.base import Alm, Effect, Map, Site, acts_through
-from mcsim.systematics.hooks import ROUNDING, HookError
+from mcsim.systematics.hooks import HookError
+
+ABSENT, SMOOTH = 1e-6, 0.01
+"""What an effect of amplitude 0 may change by rounding; and a factor of variances, whose pattern may be smoothed."""
 
 UNIFORM = 1e-9  #: relative departure of a beam from a multiple of another one that is round-off
 
@@ -98,19 +102,25 @@ def tried(acting: Sequence[Effect], site: Site) -> Beam:
 
 
 def _refuse_if_always_there(none: Effect, site: Site, time_s: Vector) -> None:
-    """Raise HookError for an effect of amplitude zero that changes something."""
-    found: dict[str, tuple[object, object]] = {
-        "gain": (none.gain(time_s, site), 0.0),
-        "steady_gain": (none.steady_gain(site), 0.0),
-        "noise": (none.noise(site), 1.0),
-        "knee": (none.knee(1.0), 1.0),
-        "spread": (none.spread(), 1.0),
-        "differencing": (none.differencing(0.0, 0), 0.0),
+    """Raise HookError for an effect of amplitude zero that changes something; one that is not defined there may be."""
+    hooks: dict[str, tuple[Callable[[], object], float]] = {
+        "gain": (lambda: none.gain(time_s, site), 0.0),
+        "steady_gain": (lambda: none.steady_gain(site), 0.0),
+        "noise": (lambda: none.noise(site), 1.0),
+        "knee": (lambda: none.knee(1.0), 1.0),
+        "spread": (none.spread, 1.0),
+        "differencing": (lambda: none.differencing(0.0, 0), 0.0),
     }
-    for hook, (value, nothing) in found.items():
-        if value is not None and np.any(np.abs(np.asarray(value) - nothing) > ROUNDING):
+    for hook, (call, nothing) in hooks.items():
+        try:
+            value = call()
+        except InputError:
+            continue
+        change = 0.0 if value is None else float(np.max(np.abs(np.asarray(value) - nothing)))
+        if change > (SMOOTH if hook == "noise" else ABSENT):
             raise HookError(
-                f"effect {none.name}: its {hook} changes the simulation at amplitude = 0; let it change nothing there."
+                f"effect {none.name}: its {hook} changes the simulation at amplitude = 0, by {change:.2g}; let it "
+                f"return {nothing:g} there, or None."
             )
 
 

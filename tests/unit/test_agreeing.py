@@ -51,6 +51,12 @@ def test_what_is_left_is_named_if_it_is_probable_without_what_fell_away(odds, ve
     context = SimpleNamespace(settings=settings, candidates=candidates, run=SimpleNamespace(channels=[]))
     left, sentences = naming.agreeing(SimpleNamespace(context=context), None, found)
     assert left.verdict == verdict
-    assert [one.members for one in left.contradicted] == [(0,)]
+    assert [one.members for one in left.contradicted] == ([(0,)] if verdict == "effect" else [(0,), (1,)])
     np.testing.assert_allclose(left.probability, 0.9999 * odds / (0.9999 * odds + 1e-4 * (1.0 + odds)), rtol=1e-6)
     assert len(sentences) == (1 if verdict == "effect" else 2)
+
+
+def test_where_nothing_is_left_nothing_is_compared():
+    """With rivals of one split beside an unlisted effect, no set describes the data."""
+    found = Attribution("unknown", None, (), 0, 1.0, (), (), 0.0)
+    assert naming.agreeing(None, None, found) == (found, [])

@@ -129,3 +129,11 @@ def test_coefficients_of_a_polarised_beam_are_no_orders_of_one(polarised) -> Non
     with refused("3, 861", "l = 40"):
         Beam.from_blm(np.stack([temperature, other, -1j * other]))
     assert Beam.from_blm(temperature).mmax == own.mmax
+
+
+@pytest.mark.parametrize("lmax", [14, 35, 299])
+def test_orders_of_a_round_beam_are_no_polarised_one(lmax) -> None:
+    """Up to a degree for which healpy's order would have as many places."""
+    own = Beam.gaussian(600.0, lmax)
+    padded = np.concatenate([own.blm, np.zeros((2, lmax + 1))])
+    np.testing.assert_allclose(Beam.from_blm(padded).blm[0], own.blm[0], rtol=1e-12)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from mcsim import config
@@ -234,6 +235,9 @@ def test_a_key_that_differs_in_case_alone_is_the_one_that_is_meant(plain, folder
         (lambda run: config.Effect(name="beam_width", chanel="V"), ("effect.chanel", "channel")),
         (lambda run: replace(run, biposh=replace(run.biposh, filter="inverse_covariance")), ("biposh.filter",)),
         (lambda run: replace(run, name=3), ("name = 3",)),
+        (lambda run: config.ScanHitAveraged(modell="wmap"), ("channel.scan.modell", "model")),
+        (lambda run: config.BeamGaussian(3.0), ("channel.beam", "3.0")),
+        (lambda run: replace(run.ensemble, seed=np.int64(3)), ("ensemble.seed = 3",)),
     ],
 )
 def test_what_python_builds_is_refused_as_a_file_is(make, named):

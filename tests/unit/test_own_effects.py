@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
+import healpy
 import numpy as np
 import pytest
 
@@ -100,8 +101,8 @@ def quits(self, sky, site, draw):
 FLAWS = {
     "a variance below zero": ("noise", lambda self, site: np.full(12 * site.nside**2, -2.2), ("-2.2", "0.5", "noise")),
     "a flag for a gain": ("gain", lambda self, time_s, site: time_s >= 0.0, ("bool", "gain")),
-    "a gain at amplitude zero": ("gain", lambda self, time_s, site: np.full(np.shape(time_s), 0.01), ("gain", "= 0;")),
-    "a variance at amplitude zero": ("noise", lambda self, site: np.full(12 * site.nside**2, 2.0), ("noise", "= 0;")),
+    "a gain at amplitude zero": ("gain", lambda self, time_s, site: np.full(np.shape(time_s), 0.01), ("gain", "0.01")),
+    "a variance at amplitude zero": ("noise", lambda self, site: np.full(12 * site.nside**2, 2.0), ("noise", "1")),
     "a sky that is not real": ("sky", imaginary, ("sky", "m = 0", "real")),
     "a program's end": ("sky", quits, ("sky", "SystemExit")),
 }
@@ -114,3 +115,36 @@ def test_what_a_hook_must_not_return_is_refused_before_a_run(flaw):
     site = survey(config.load(two_channels("hooked"))).channels[0].site
     with refused("hooked", *named):
         systematics.tried((kind(amplitude=0.5),), site)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decaying(Own):
+    name = "decaying"
+
+    def gain(self, time_s, site):
+        return self.amplitude * np.exp(-time_s / self.amplitude)
+
+    def noise(self, site):
+        return healpy.smoothing(1.0 + self.amplitude * np.linspace(0.0, 1.0, 12 * site.nside**2), 0.3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Brighter(Own):
+    name = "brighter"
+
+    def sky(self, sky, site, draw):
+        return (1.0 + self.amplitude) * sky
+
+
+@dataclass(frozen=True, kw_only=True)
+class BrighterStill(Brighter):
+    name = "brighter_still"
+
+    def sky(self, sky, site, draw):
+        return super().sky(super().sky(sky, draw=draw, site=site), site, draw)
+
+
+@pytest.mark.parametrize("kind", [Decaying, BrighterStill])
+def test_effects_that_are_undefined_or_smooth_at_zero_or_inherit_are_let_be(kind):
+    site = survey(config.load(two_channels("let"))).channels[0].site
+    systematics.tried((kind(amplitude=0.5),), site)

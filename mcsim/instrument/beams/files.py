@@ -66,8 +66,12 @@ def _of_array(array: NDArray) -> NDArray[np.complex128]:
             "shape (mmax + 1, lmax + 1)"
         )
     own = alm_.lmax_of(array.shape[1]) if len(array) == 3 else None
-    # E and B begin at l = 2, and with m = 1 at place own + 1 of healpy's order.
+    # T has no l = m = 1 without an offset, E and B have none and begin at l = 2; B_l of a round beam does not vanish.
     if own is not None and own > 1 and not np.any(array[1:, [0, 1, own + 1]]):
+        polarised = bool(np.any(array[1:])) or array[0, own + 1] == 0.0
+    else:
+        polarised = False
+    if polarised:
         raise InputError(
             f"an array of b_lm has the shape {array.shape}, that of T, E and B of a beam up to l = {own}: give its "
             "first row, the temperature beam"
