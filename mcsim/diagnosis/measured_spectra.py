@@ -14,7 +14,8 @@ from mcsim.diagnosis.output import DIGEST, digest
 from mcsim.errors import InputError
 from mcsim.support.arrays import Matrix, Vector
 
-MORE = 8  #: times as many skies as otherwise over which a response is averaged at most
+MORE = 16  #: times as many skies as otherwise over which a response is averaged at most
+KNOWN = 0.15  #: error of an amplitude by the response that is not known, over its error by the data, up to which it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,7 @@ class MeasuredSpectra(DataSet[Spectra]):
     bin and tested with the others. What the former predict of the latter, where simulations find them correlated, is
     subtracted; the correlation that remains is stated. Rotated to other frames are only spectra with every M, real and
     imaginary. A mean of many skies may have smaller errors than a response over a few: this is averaged over twice as
-    many, and again, until it has none to speak of beside them, ``settled_sigma``.
+    many, and again, until it has none to speak of beside them (:data:`KNOWN`).
     """
 
     _without: dict[range, Matrix] = field(default_factory=dict, init=False, repr=False)  # effects, by their skies
@@ -82,13 +83,17 @@ class MeasuredSpectra(DataSet[Spectra]):
         return before, after
 
     def _is_known(self, changes: Matrix) -> bool:
-        """Return True if the mean of changes, shape (skies, p), is known well beside the errors of the data."""
-        null, settings = self.context.null, self.context.settings
+        """Return True if the mean of changes, shape (skies, p), is known well beside the errors of the data.
+
+        What scatters along it changes the amplitude; what scatters across it is fitted less by the data than it is
+        large, and the amplitude is smaller by this part of the square.
+        """
+        null = self.context.null
         white = np.sqrt(null.hartlap_factor) * null.whiten_templates(changes.T)
-        mean, variance = white.mean(axis=1), white.var(axis=1, ddof=1).sum() / len(changes)
-        along = float(np.std(mean @ white, ddof=1)) / max(float(np.linalg.norm(mean)), 1e-300)
-        known = along <= settings.settled_sigma * np.sqrt(len(changes))
-        return bool(known and variance <= settings.settled_sigma * np.sqrt(2.0 * null.dimension))
+        mean, scatter = white.mean(axis=1), white.var(axis=1, ddof=1).sum() / len(changes)
+        size = max(float(np.linalg.norm(mean)), 1e-300)
+        along = float(np.std(mean @ white, ddof=1)) / size / np.sqrt(len(changes))
+        return bool(np.hypot(along, scatter / size) <= KNOWN and scatter <= KNOWN * np.sqrt(2.0 * null.dimension))
 
     def notes(self) -> list[str]:
         """Return a sentence if the table's errors are far from the scatter of the simulations."""

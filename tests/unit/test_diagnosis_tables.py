@@ -25,6 +25,7 @@ from mcsim.diagnosis.naming import slices_of
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotate_biposh
+from mcsim.stats.gaussian import SimulatedGaussian
 from refusals import refused
 
 PROPOSED = ("beam_ellipticity", "beam_width", "dipole_modulation", "quadrupole_modulation")
@@ -129,6 +130,41 @@ def test_a_table_of_maps_that_were_filtered_otherwise_is_refused(stated, needed,
         read(tmp_path, table, run)
     table.meta["filter"] = needed
     assert len(read(tmp_path, table, run).rows)
+
+
+@pytest.mark.parametrize(("skies", "along", "across", "known"), [
+    (24, 0.1, 0.1, True), (24, 1.0, 0.1, False), (24, 0.1, 1.5, False), (384, 1.0, 1.5, True),
+])  # fmt: skip
+def test_a_response_is_known_from_as_many_skies_as_its_scatter_asks_for(skies, along, across, known):
+    """Of 20 standard deviations in one of 60 numbers; over the errors of the data, along it and in each of the others.
+
+    Averaged over 24 skies, a table of 25 had amplitudes 0.8 +- 0.2 of their errors too small, one of 1,600 no name.
+    """
+    rng = np.random.default_rng(2)
+    null = SimulatedGaussian.from_simulations(rng.normal(size=(100_000, 60)))
+    size = np.where(np.arange(60) == 0, along, across)
+    changes = 20.0 * (np.arange(60) == 0) + size * rng.normal(size=(skies, 60))
+    data = SimpleNamespace(context=SimpleNamespace(null=null))
+    assert MeasuredSpectra._is_known(data, changes) == known
+
+
+def test_more_skies_are_simulated_once_for_all_effects(small, tmp_path):
+    """The pairs of one sky differ by the effect alone."""
+    spectra, asked = read(tmp_path, measured(RUN)), []
+
+    def ask(jobs):
+        asked.extend((job.first, job.count, "beam_width" in job.simulated) for job in jobs)
+        return [spectra(job) for job in jobs]
+
+    data = MeasuredSpectra(small, spectra, ask)
+    found = [config.Effect(name="beam_width", channel="W1", parameters={"amplitude": 1e-6})]
+    object.__setattr__(data, "_is_known", lambda changes: len(changes) >= 48)
+    for _ in range(2):
+        before, after = data.pair_extended(found, 8)
+        assert len(before) == len(after) == 48
+        assert np.abs(after - before).max() < 1e-3 * small.ensemble.spread.max()
+    assert sum(count for _, count, acts in asked if not acts) == 24
+    assert sum(count for _, count, acts in asked if acts) == 2 * 48
 
 
 def test_the_mean_of_skies_scatters_as_the_tests_take_it_to(small):
