@@ -216,7 +216,5 @@ def _in_words(table: type, path: tuple[str, ...]) -> None:
     type.__setattr__(table, "__init__", init)
 
 
-for _table, _path in {
-    table: path for path, table in reversed([*_TABLES.items(), (("effect",), schema.Effect)])
-}.items():
+for _table, _path in {table: path for path, table in reversed(_TABLES.items())}.items():
     _in_words(_table, _path)
