@@ -91,8 +91,7 @@ def open_summary(path: str | Path) -> "xr.Dataset":
             f"{path} has no summary, because no run on it has ended yet; continue it with mcsim run --resume."
         )
     found = _opened(target, "summary")
-    finished = int(store.done(target).sum())
-    if (count := int(found["count"])) < finished:
+    if (count := int(found["count"])) < store.size(target) and count < (finished := int(store.done(target).sum())):
         warnings.warn(
             f"the summary of {path} is of {count} realizations, and {finished} are finished since; mcsim run --resume "
             "makes it of all.",
