@@ -36,7 +36,7 @@ class Layout:
         coefficients = "BipoSH coefficient A^{LM}_{l2-d,l2} at ell = l2"
         spectra = {
             "biposh": (("pair", "mode", "ell"), "complex128", "uK^2", coefficients),
-            "cl": (("pair", "ell"), "float64", "uK^2", "power spectrum C_l of the map, beam and noise in it"),
+            "cl": (("pair", "ell"), "float64", "uK^2", "power spectrum C_l with beam and noise"),
         }
         if self.filtered:
             text = "quadratic maximum-likelihood l(l+1)/2pi A^{LM}, by bin"
