@@ -19,7 +19,7 @@ from mcsim.bipolar.theory import (
     signal_to_noise,
 )
 from mcsim.ensemble import plan, summary
-from mcsim.ensemble.expectation import L_WEIGHTS, Means, nearer, spectrum
+from mcsim.ensemble.expectation import L_WEIGHTS, Means, circular_window, spectrum
 from mcsim.simulation.filtering import LOWEST
 from mcsim.simulation.survey import Survey
 from mcsim.support.arrays import divided
@@ -36,7 +36,8 @@ def cl_of(survey: Survey, monopole: NDArray[np.complex128]) -> NDArray[np.float6
     return (-1.0) ** ell * monopole.real / np.sqrt(2.0 * ell + 1.0)
 
 
-def _total_cl(survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[int, int]) -> NDArray[np.float64]:
+def total_cl(survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[int, int]) -> NDArray[np.float64]:
+    """Return C_l of a pair of maps with their noise, uK^2, shape (lmax + 1,)."""
     monopole = survey.estimator.modes.index(MONOPOLE)
     return cl_of(survey, (found[pair].beam + found[pair].noise)[monopole])
 
@@ -76,13 +77,11 @@ def scattered(survey: Survey, found: dict[tuple[int, int], Means], number: int) 
     It is what the spectrum has above that of the full sky; negative where weights take more away than they bring.
     """
     channel = next(one for one in survey.channels if survey.maps[number] in one.maps)
-    degrees = np.arange(survey.lmax + 1)
-    window = nearer(survey, channel)[: survey.lmax + 1]
-    beam = np.sqrt(4.0 * np.pi / (2.0 * degrees + 1.0)) * channel.beam.blm[0, : survey.lmax + 1].real * window
+    beam = (circular_window(survey, channel)[: survey.lmax + 1] / channel.window[: survey.lmax + 1]) ** 2
     own = found[number, number]
     monopole = survey.estimator.modes.index(MONOPOLE)
     there = cl_of(survey, own.circular[monopole])
-    return divided(there - spectrum(survey)[: survey.lmax + 1] * beam**2, there + cl_of(survey, own.noise[monopole]))
+    return divided(there - spectrum(survey)[: survey.lmax + 1] * beam, there + cl_of(survey, own.noise[monopole]))
 
 
 def variances_of(
@@ -105,7 +104,7 @@ def variances_of(
 def _spectra(survey: Survey, found: dict[tuple[int, int], Means], pair: tuple[int, int], share: float = 1.0) -> Spectra:
     """Return the total spectra of a pair, with a share of the square of the cross spectrum."""
     x, y = pair
-    xx, yy, xy = (_total_cl(survey, found, one) for one in ((x, x), (y, y), pair))
+    xx, yy, xy = (total_cl(survey, found, one) for one in ((x, x), (y, y), pair))
     return Spectra(xx, yy, np.sqrt(share) * xy)
 
 
@@ -173,7 +172,7 @@ def joint_signal_to_noise(survey: Survey, beams: Sequence[ScannedBeam], found: d
     for pair in kept:
         x, y = (place[index] for index in pair)
         share = _overlap(survey, pair).shared
-        cl[x, y] = cl[y, x] = np.sqrt(share) * _total_cl(survey, found, pair)
+        cl[x, y] = cl[y, x] = np.sqrt(share) * total_cl(survey, found, pair)
         beam = np.nan_to_num(_added(survey, found[pair]))
         for row, (L, M, d) in enumerate(modes):
             signal[x, y, row] = beam[stored.index(Mode(L, M, d))]

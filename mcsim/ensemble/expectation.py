@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from healpy import nside2pixarea
 from numpy.typing import NDArray
 
 from mcsim import config, systematics
+from mcsim.bipolar import by_degree
 from mcsim.bipolar.modes import Indices, existing
 from mcsim.bipolar.theory import (
     ScannedBeam,
@@ -19,6 +21,7 @@ from mcsim.bipolar.theory import (
     noise_biposh,
     orientation_harmonics,
     parallel_transport_harmonics,
+    pseudo_spectrum,
 )
 from mcsim.bipolar.theory.harmonics import spin_functions
 from mcsim.config import preparation as declared
@@ -29,15 +32,16 @@ from mcsim.simulation.channels import refuse_unseen
 from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
+from mcsim.sphere.checks import nside_of
 from mcsim.support.arrays import Cl, Map, divided
 
 Source = str | Path | Mapping[str, Any] | config.RunConfig | Survey
 
 L_MOMENTS = 64  #: highest degree of the orientation moments in predictions to all orders in the beam
 
-L_WEIGHTS, SHARE = range(64, 193, 32), 0.99
-"""Highest degrees of moments times weights, of which the first is taken that holds this share of the weights' square.
-"""
+L_WEIGHTS, SHARE, SCATTERED = range(64, 193, 32), 0.99, 0.01
+"""Highest degrees of moments times weights, of which the first is taken that holds a share of the weights' square, and
+beyond which weights scatter at most another share of the spectrum into any degree."""
 
 FOLDED = 0.1  #: of prepared noise at the highest l: what averages fold into it from beyond the degrees of their pixels
 EVEN, MOVED = 1e-6, 0.01
@@ -177,21 +181,56 @@ def moments_needed(survey: Survey, exact: bool, L_moments: int | None = None) ->
 
     Raise InputError for one below biposh.L_max, from where on there would be no signal.
     """
-    weights = [m.weight for m in survey.maps if _weighted(survey, m).weight is not None]
     L_max = survey.config.biposh.L_max
+    weighted = [(m, c) for c in survey.channels for m in c.maps if _weighted(survey, m).weight is not None]
     if L_moments is not None and L_moments < L_max:
         raise InputError(f"L_moments = {L_moments} is below biposh.L_max = {L_max}; give L_moments >= {L_max}.")
-    if not (exact or weights):
+    if not (exact or weighted):
         return L_max
     if L_moments is not None:
         return L_moments
-    return max(L_max, max((_degrees_of(weight) for weight in weights if weight is not None), default=L_MOMENTS))
+    return max(L_max, max((_degrees_for(survey, m, channel) for m, channel in weighted), default=L_MOMENTS))
 
 
 def _degrees_of(weight: Map) -> int:
     """Return the first of ``L_WEIGHTS`` up to which a weight has nearly all of its square."""
     share = held(weight, L_WEIGHTS[-1])
     return next((L for L in L_WEIGHTS if share[L] >= SHARE), L_WEIGHTS[-1])
+
+
+def _degrees_for(survey: Survey, m: SurveyMap, channel: Channel) -> int:
+    """Return the first of ``L_WEIGHTS`` from ``_degrees_of`` on beyond which a map's weight scatters little power."""
+    assert m.weight is not None  # the caller looked
+    cl = spectrum(survey) * circular_window(survey, channel) ** 2
+    whole = _scattered(cl, m.weight, m.weight, survey.lmax)
+    near = range(_degrees_of(m.weight), L_WEIGHTS[-1], L_WEIGHTS.step)
+    beyond = ((L, _scattered(cl, m.weight, m.weight, survey.lmax, L)) for L in near)
+    return next((L for L, less in beyond if np.all(less <= SCATTERED * whole)), L_WEIGHTS[-1])
+
+
+def circular_window(survey: Survey, channel: Channel) -> Cl:
+    """Return what the round part of a channel's beam and its pixels make of a_lm, up to the degrees of the sky."""
+    beam = channel.beam.blm[:1] * channel.window * nearer(survey, channel)
+    none = np.zeros((1, 1, 1), dtype=np.complex128)
+    return np.asarray(ScannedBeam(beam, none).response(len(spectrum(survey)) - 1)[0].real)
+
+
+def _scattered(cl: Cl, x: Map, y: Map, lmax: int, beyond: int = -1) -> Cl:
+    """Return the cross spectrum of an isotropic sky in two weights, (lmax + 1,), by their degrees beyond a given one.
+
+    It is not divided by <W_x W_y>.
+    """
+    top = min(3 * nside_of(x.size, "a weight") - 1, lmax + len(cl) - 1)
+    one, two = (_harmonics(np.asarray(w, dtype=np.float64).tobytes(), top) for w in (x, y))
+    weights = by_degree(one, two, top) / (2.0 * np.arange(top + 1) + 1.0)
+    weights[: beyond + 1] = 0.0
+    return pseudo_spectrum(cl, weights, lmax)
+
+
+@lru_cache(maxsize=4)
+def _harmonics(weight: bytes, top: int) -> NDArray[np.complex128]:
+    """Return a_lm of the bytes of a weight; the last ones are kept, for maps have few weights."""
+    return healpix.analysis(np.frombuffer(weight), top, iterations=3)
 
 
 def held(weight: Map, L_max: int) -> Cl:
@@ -211,13 +250,41 @@ def signal(
     """Return the mean of the sky seen through beams by a pair of maps (indices), uK^2, shape (mode, lmax + 1).
 
     It is of leading order in their non-circular part, or of all orders if ``exact``, normalised as the estimates are.
+    What weights scatter by degrees beyond those of the moments is in C_l alone, of the round parts of the beams.
     """
     x, y = beams
     y = x if pair[0] == pair[1] else y
     summed = cmb_biposh_exact if exact else cmb_biposh_leading
     found = summed(modes, spectrum(survey), survey.lmax, x, y, nthreads=nthreads)
     weights = [np.ones(1) if (w := _weighted(survey, survey.maps[i]).weight) is None else w for i in pair]
+    if (0, 0, 0) in modes and x.weighted and y.weighted:
+        ell = np.arange(survey.lmax + 1)
+        further = _further(survey, (x, y), pair, min(x.L_max, y.L_max))
+        found[list(modes).index((0, 0, 0))] += (-1.0) ** ell * np.sqrt(2.0 * ell + 1.0) * further
     return without_windows(survey, found / np.mean(weights[0] * weights[1]), modes, pair)
+
+
+def _further(survey: Survey, beams: tuple[ScannedBeam, ScannedBeam], pair: tuple[int, int], beyond: int) -> Cl:
+    """Return the cross spectrum that two weights scatter by degrees beyond those of the moments."""
+    cl = spectrum(survey)
+    for beam in beams:
+        cl = cl * beam.circular.response(len(cl) - 1)[0].real
+    weights = [w for i in pair if (w := survey.maps[i].weight) is not None]
+    return _scattered(cl, weights[0], weights[-1], survey.lmax, beyond)
+
+
+def beyond_moments(survey: Survey, number: int, L_moments: int) -> Cl:
+    """Return the spectrum of a map (index) that its weights scatter by degrees beyond ``L_moments``, uK^2, (lmax + 1,).
+
+    It is normalised as the estimates are; of a map without weights it is zero.
+    """
+    weight = _weighted(survey, m := survey.maps[number]).weight
+    if weight is None:
+        return np.zeros(survey.lmax + 1)
+    channel = next(one for one in survey.channels if m in one.maps)
+    cl = spectrum(survey) * circular_window(survey, channel) ** 2
+    further = _scattered(cl, weight, weight, survey.lmax, L_moments)
+    return np.asarray(further / np.mean(weight**2) / channel.window[: survey.lmax + 1] ** 2)
 
 
 def means(

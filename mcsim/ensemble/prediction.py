@@ -17,6 +17,7 @@ from mcsim.ensemble import detectability, plan, summary
 from mcsim.ensemble.expectation import (
     Means,
     Source,
+    beyond_moments,
     dipoles_left,
     held,
     means,
@@ -29,6 +30,7 @@ from mcsim.simulation import power
 from mcsim.simulation.survey import Survey
 from mcsim.sphere.checks import check_whole
 from mcsim.stats.streaming import Sums
+from mcsim.support.arrays import divided
 
 if TYPE_CHECKING:
     from mcsim.ensemble.runner import Workers
@@ -36,8 +38,9 @@ if TYPE_CHECKING:
 Pairs = Iterable[tuple[int, int]]
 
 COARSE = 0.95  #: share of the square of weights that a prediction must hold not to warn
-LOWEST, SCATTERED = 6, 0.3
-"""Degree from which errors behind masks hold, and the share of a spectrum that a mask may scatter there."""
+LOWEST, SCATTERED, LEFT_OUT = 6, 0.3, 0.1
+"""Degree from which errors behind masks hold, and the shares of a spectrum that a mask may scatter there: in all, and
+from further than a prediction follows in modes other than C_l."""
 
 
 def predict(
@@ -62,7 +65,8 @@ def predict(
     L_moments
         Highest degree of the orientation moments if ``exact``, and of weights of pixels, such as masks; see
         :func:`mcsim.bipolar.theory.cmb_biposh_exact`. At least biposh.L_max, which is enough without these two, and
-        then taken whatever is given. Default: 64; with weights up to 192, until it holds 99 % of their square.
+        then taken whatever is given. Default: 64; with weights up to 192, until it holds 99 % of their square, and
+        what they scatter from further is at most 1 % of C_l.
     nthreads
         Number of threads.
     workers
@@ -90,11 +94,12 @@ def predict(
     transport) and C_l. The pixel window multiplies the beam and divides the result of the analysis. The scan couples
     degrees in between, so it cancels only in part. Noise of variance v(n) per pixel adds v_LM times the pixel area to
     the autos. Weights W(n) (masks, unobserved pixels) replace w_0 = 1 by W and w_s by W w_s in the sum over L1 and L2,
-    divided by <W_x W_y>: the BipoSH that they give an isotropic sky are those of the circular-beam control. What they
-    have beyond ``L_moments`` is left out; the attribute ``mask`` says how much that is. Steps of a preparation in
-    harmonics multiply the noise before them by their windows at l1 and l2, or, where the maps are masked after them,
-    make it an isotropic sky that the weights couple; noise that is uneven there is refused. Filtered maps have the
-    means of the full sky without the mean field, and the noise of the pixels as the filter weights them.
+    divided by <W_x W_y>: the BipoSH that they give an isotropic sky are those of the circular-beam control. Degrees of
+    weights beyond ``L_moments`` count in C_l, and with it in errors, but not in the means of L > 0: a warning says
+    where these lack more than a tenth of the spectrum (behind a sharp mask, where the beam ends it). Steps of a
+    preparation in harmonics multiply the noise before them by their windows at l1 and l2, or, where the maps are
+    masked after them, make it an isotropic sky that the weights couple; noise that is uneven there is refused. Filtered
+    maps have the means of the full sky without the mean field, and the noise of the pixels as the filter weights them.
     Variances are C_l1 C_l2 (1 + delta_l1l2), of pairs C^XX_l1 C^YY_l2 + (-1)^L delta_l1l2 (C^XY_l)^2, each term times
     what the weights make of it (:func:`mcsim.bipolar.theory.overlap`), of bins with the correlation of degrees.
     They lack what uneven hits and the beam's own anisotropy make: of 1,000 skies at nside 16, l = 8 to 38, variances of
@@ -132,7 +137,7 @@ def predict(
     found = found_for(survey, survey.pairs)
     result = _dataset(survey, found)
     result.attrs |= _attributes(survey, exact, L_moments)
-    _warn_of_scattered(survey, found)
+    _warn_of_scattered(survey, found, L_moments)
     if not snr:
         return result
     # The joint information of all maps needs every pair in both orders, whatever pairs the ensemble keeps.
@@ -225,11 +230,23 @@ def _dataset(survey: Survey, found: dict[tuple[int, int], Means]) -> xr.Dataset:
     return result
 
 
-def _warn_of_scattered(survey: Survey, found: dict[tuple[int, int], Means]) -> None:
-    """Warn of degrees whose power is mostly that of others, and has the scatter of theirs."""
+def _warn_of_scattered(survey: Survey, found: dict[tuple[int, int], Means], L_moments: int) -> None:
+    """Warn of degrees whose power is mostly that of others, and has the scatter of theirs, or is not in all modes."""
     for number, (m, name) in enumerate(zip(survey.maps, survey.map_names, strict=True)):
         if m.weight is None or survey.filtering is not None or (number, number) not in found:
             continue
+        left = divided(
+            beyond_moments(survey, number, L_moments), detectability.total_cl(survey, found, (number, number))
+        )
+        if left.max() > LEFT_OUT:
+            first, worst = int(np.argmax(left > LEFT_OUT)), int(np.argmax(left))
+            warnings.warn(
+                f"the mask of {name} scatters power over more than {L_moments} degrees, {100.0 * left[first]:.0f} % of "
+                f"the spectrum at l = {first} and {100.0 * left[worst]:.0f} % at l = {worst}: C_l has it, but means of "
+                f"L > 0 lack it; give more than L_moments = {L_moments}, apodise the mask, lower biposh.lmax, or take "
+                "the means of an ensemble.",
+                stacklevel=3,
+            )
         share = detectability.scattered(survey, found, number)[LOWEST:]
         if share.size and share.max() > SCATTERED:
             first, worst = LOWEST + int(np.argmax(share > SCATTERED)), LOWEST + int(np.argmax(share))
@@ -253,11 +270,11 @@ def _attributes(survey: Survey, exact: bool, L_moments: int) -> dict[str, Any]:
     elif weights:
         errors += f", of each M behind the weights as at high l: some 14 % rms off at l < {LOWEST}"
         share = min(held(weight, L_moments)[L_moments] for weight in weights)
-        mask = f"weights W up to L = {L_moments}, which hold {share:.3f} of their square"
+        mask = f"weights W up to L = {L_moments}, which hold {share:.3f} of their square; all of them in C_l"
         if share < COARSE:
             warnings.warn(
                 f"the weights of the maps have {100.0 * (1.0 - share):.0f} % of their square beyond L = {L_moments}, "
-                "which the prediction leaves out; apodise the mask, or give more L_moments.",
+                "which the prediction leaves out of all but C_l; apodise the mask, or give more L_moments.",
                 stacklevel=3,
             )
     window, left_out = "none: rings without pixels", "nothing"

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import healpy
@@ -51,6 +52,29 @@ def test_errors_hold_below_the_degree_that_the_warning_names() -> None:
     assert abs(np.mean(below) - 1.0) < 0.05 + 3.0 / np.sqrt(2.0 * REALIZATIONS * below.size)
     assert 2.0 < np.mean(beyond) < 4.5
     assert share > 100 * SCATTERED
+
+
+def test_a_spectrum_that_a_narrow_map_scatters_is_all_there() -> None:
+    """Where the beam ends it, all power comes from afar: degrees of weights up to 64 alone had 1e-9 of it at l = 95."""
+    height = healpy.pix2vec(64, np.arange(12 * 64**2))[2]
+    steep = run(nside=64, mask=np.where(np.abs(height) > 0.34, 1.0, 0.0))
+    beam = replace(steep.channels[0], beam=config.BeamGaussian(fwhm_arcmin=600.0))
+    whole = replace(steep, sky=replace(steep.sky, lmax=95), channels=(beam,))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        expected = mcsim.predict(whole, L_moments=64).cl_mean.values[0]
+    assert any("over more than 64 degrees" in str(one.message) for one in said)
+    simulated = survey(whole)
+    maps = np.array([simulate.realize(simulated, r)["cl"][0] for r in range(40)])
+    # Neighbours have the scatter of the few bright degrees that their power comes from.
+    low, high = expected[20:40].mean(), expected[80:].mean()
+    for mean, found in ((low, maps[:, 20:40].mean(axis=1)), (high, maps[:, 80:].mean(axis=1))):
+        assert abs(found.mean() - mean) < 4.0 * found.std(ddof=1) / np.sqrt(len(maps))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "the mask .* over more than")
+        warnings.filterwarnings("ignore", "the mask .* of other degrees")
+        itself = mcsim.predict(whole).cl_mean.values[0]  # takes as many as it needs
+    np.testing.assert_allclose(itself, expected, rtol=0.01)
 
 
 @pytest.mark.parametrize("changes", [{"mask": None}, {"mask_apodisation_deg": 30.0}], ids=["full", "apodised"])

@@ -7,7 +7,7 @@ import wignernj
 from scipy.special import sph_harm_y
 
 from mcsim.bipolar.modes import modes as all_modes
-from mcsim.bipolar.theory import FULL_SKY, Spectra, isotropic_variance, overlap
+from mcsim.bipolar.theory import FULL_SKY, Spectra, isotropic_variance, overlap, pseudo_spectrum
 from mcsim.ensemble import summary
 from mcsim.ensemble.layout import Layout
 
@@ -148,3 +148,30 @@ def test_covariance_of_bins_is_that_of_the_sums_of_their_coefficients() -> None:
             shifted[n, row, : lmax + 1 - n] = np.diag(covariance, n)
         found = summary.binned_covariance(layout, list(shifted))[row]
         np.testing.assert_allclose(found, used @ covariance @ used.T, rtol=1e-12)
+
+
+def test_the_spectrum_behind_weights_is_a_sum_over_3j_symbols() -> None:
+    rng = np.random.default_rng(5)
+    cl, weights = rng.random(7), rng.random(9)
+    expected = [
+        sum(
+            (2 * k + 1) * cl[k] * (2 * n + 1) * weights[n] * float(wignernj.wigner3j(ell, k, n, 0, 0, 0)) ** 2
+            for k in range(7)
+            for n in range(9)
+        )
+        for ell in range(11)
+    ]
+    np.testing.assert_allclose(pseudo_spectrum(cl, weights, 10), np.array(expected) / (4 * np.pi), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("size", "reach", "d_max"), [(5, 9, 2), (14, 20, 8), (9, 8, 2)])
+def test_weights_of_few_degrees_have_bins_that_reach_further(size: int, reach: int, d_max: int) -> None:
+    """ducc0 ended here with an error of its own: a field of spin n has no degrees below n."""
+    weight = belt(Z)
+    found = overlap(weight, weight, reach, size, d_max)
+    assert found.around is not None
+    known = overlap(weight, weight, min(reach, size - d_max), size, d_max)
+    assert known.around is not None
+    np.testing.assert_allclose(found.autos[: len(known.autos)], known.autos, atol=1e-12)
+    for mode in ((0, 0, 0), (2, 0, 0), (2, 1, 2)):
+        np.testing.assert_allclose(found.around.beside(mode, 0), known.around.beside(mode, 0), atol=1e-10)

@@ -16,6 +16,7 @@ from mcsim.bipolar.theory.detectability import (
     signal_to_noise,
 )
 from mcsim.bipolar.theory.harmonics import map_harmonics, orientation_harmonics, parallel_transport_harmonics
+from mcsim.bipolar.theory.pseudo_spectrum import pseudo_spectrum
 
 __all__ = [
     "FULL_SKY",
@@ -32,5 +33,6 @@ __all__ = [
     "orientation_harmonics",
     "overlap",
     "parallel_transport_harmonics",
+    "pseudo_spectrum",
     "signal_to_noise",
 ]

@@ -50,10 +50,13 @@ def circles(
     """
     own, other, both = products
     top = int(max(np.flatnonzero(np.abs(product).any(axis=1))[-1] for product in products))
+    top = max(top, reach + d_max)  # a field of spin n has no degrees below n
+    alike = own is other
+    own, other, both = (_up_to(top, product) for product in (own, other, both))
     theta = ducc0.misc.GL_thetas(top + d_max + 1)
     share = ducc0.misc.GL_weights(top + d_max + 1, 1) / (4.0 * np.pi)
     first = _fields(own, top, reach, len(theta))
-    second = first if own is other else _fields(other, top, reach, len(theta))
+    second = first if alike else _fields(other, top, reach, len(theta))
     mixed = _fields(both, top, reach + d_max, len(theta))
     autos = np.mean((first * second.conj()).real, axis=-1)
     cross = np.empty((d_max + 1, reach + 1, len(theta)))
@@ -62,6 +65,12 @@ def circles(
             below = mixed[d - n] if n <= d else mixed[n - d].conj()
             cross[d, n] = np.mean((mixed[d + n] * below).real, axis=-1)
     return Circles(theta, share, autos / unit, cross / unit)
+
+
+def _up_to(top: int, product: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return harmonics of this layout with zeros up to a degree, if they end before it."""
+    more = max(top + 1 - len(product), 0)
+    return np.pad(product, ((0, more), (more, more)))
 
 
 def _fields(product: NDArray[np.complex128], top: int, reach: int, rings: int) -> NDArray[np.complex128]:
