@@ -10,10 +10,13 @@ from mcsim.support.arrays import Matrix, Vector, divided
 REPEATS = 1e-6
 """Rms difference over the rms up to which two maps or data vectors are the same: threads add numbers in any order."""
 
-ALONE = 0.8
-"""Share of the variance of an element that one realization may make: it then is 2 sqrt(N) standard deviations of the N
-others away. The tails of products of sky and noise make 0.5 of 60 realizations at most, and 0.1 of 600.
+FAR = 40.0
+"""Largest distance of a realization from the median of an element, in its scatter by the median distance, or 2 sqrt(N)
+of N if that is less. Models of ours have 15 at most, of 300: the tails of products of sky and noise. A map of another
+sky in one to ten of 300 makes 200 and more.
 """
+
+SIGMA = 1.4826  #: standard deviation over the median distance from the median, of a Gaussian
 
 
 def check_distinct(rows: Matrix, source: Source, seed: int) -> None:
@@ -36,18 +39,20 @@ def check_distinct(rows: Matrix, source: Source, seed: int) -> None:
 
 
 def check_alike(rows: Matrix, source: Source, seed: int) -> None:
-    """Raise InputError if one of the data vectors, shape (N, p), makes the scatter of an element almost by itself.
+    """Raise InputError if data vectors, shape (N, p), are none like the others: those with a map of another sky.
 
-    One with a map of another sky does. In the covariance of such a sample nothing departs from the model any more.
+    In the covariance of a sample with some of them nothing departs from the model any more.
     """
-    squares = (rows - rows.mean(axis=0)) ** 2
-    shares = divided(squares, squares.sum(axis=0)).max(axis=1)
-    worst = int(shares.argmax())
-    if shares[worst] > ALONE:
+    distances = np.abs(rows - np.median(rows, axis=0))
+    far = divided(distances, SIGMA * np.median(distances, axis=0)).max(axis=1)
+    limit = min(FAR, 2.0 * np.sqrt(len(rows)))
+    worst, others = int(far.argmax()), int(np.sum(far > limit)) - 1
+    if far[worst] > limit:
+        beside, them = (f" and {others} more are", "their") if others else (" is", "its")
         raise InputError(
-            f"{source.words(seed, worst)} is none like the others: it makes {100.0 * shares[worst]:.3g} % of the "
-            f"variance of what is measured in {len(rows)} of them, and {100.0 * ALONE:g} % are the most that one may; "
-            "see if its maps are of one sky and of this survey, or leave it out."
+            f"{source.words(seed, worst)}{beside} none like the others of {len(rows)}: up to {far[worst]:.3g} times "
+            f"the scatter of what is measured away from their median, where {limit:.3g} are the most; see if {them} "
+            f"maps are of one sky and of this survey, or leave {'them' if others else 'it'} out."
         )
 
 
