@@ -99,11 +99,10 @@ def plugin(name: str, structure: Structure, theta: Vector, scene: Scene) -> Plug
         return None
     common = structure.channel is None and len(scene.channels) > 1
     scope = {"scope": "common"} if common or base == "SkyPower" else {}
-    framed = (
-        base in ("AddedPattern", "CompactSource", "GainPattern", "RotatedSky", "BoostedSky", "NoisePattern")
-        or values.get("wave") in ("sky", "orientation")  # psi is counted from the meridian of the maps
-    )
-    frame = {"frame": scene.frame} if framed else {}
+    fixed = base in ("AddedPattern", "CompactSource", "GainPattern", "RotatedSky", "BoostedSky", "NoisePattern")
+    frame = {"frame": scene.frame} if fixed or values.get("wave") == "sky" else {}
+    if values.get("wave") == "orientation":
+        frame = {"frame": scene.scan_frame}
     shared = {} if structure.index is None else {"index": structure.index, "foreground": True}
     return Plugin(name, base, structure.channel or scene.channels[0], {**scope, **frame, **values, **shared})
 

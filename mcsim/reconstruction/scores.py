@@ -95,8 +95,9 @@ class Scene:
     frequencies: tuple[float | None, ...]
     splits: tuple[str, ...]
     foregrounds: tuple[bool, ...]  #: False: the maps of a channel are those of a component separation
-    #: frame, nside, lmax: of the maps and of the filtered sky
+    #: frame, nside, lmax: of the maps and of the filtered sky; scan_frame: whose meridian waves in psi count from
     frame: str
+    scan_frame: str
     nside: int
     lmax: int
     dipole_uk: Vector  #: that the survey sees besides, shape (3,)

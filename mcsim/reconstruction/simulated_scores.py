@@ -45,7 +45,7 @@ from mcsim.simulation import simulate
 from mcsim.simulation.pixel_means import Part, signal_of
 from mcsim.simulation.tod import Samples, every_ring, samples
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import healpix
+from mcsim.sphere import healpix, rotation
 from mcsim.support import folders
 from mcsim.support.arrays import Map, Matrix, Vector, divided
 from mcsim.support.code import LIBRARIES, class_digest, package_digest
@@ -112,10 +112,12 @@ def scene_of(model: Model) -> Scene:
     run = model.survey.config
     splits = run.map.splits or ("",)
     sites = [channel.site for channel in model.survey.channels]
-    timed = run.map.split_by != "sets" and all(site.pointing is not None for site in sites)
-    pointed = [site.pointed("a wave").line for site in sites] if timed else []
-    lines = tuple((line.boresight_angle_deg, line.azimuth_deg) for line in pointed)
+    pointed = all(site.pointing is not None for site in sites)
+    timed, scan_frame = run.map.split_by != "sets" and pointed, "ecliptic" if pointed else model.frame
+    known = [site.pointed("a wave").line for site in sites] if timed else []
+    lines = tuple((line.boresight_angle_deg, line.azimuth_deg) for line in known)
     elsewhere = [directions(own, dict(zip(model.channels, lines, strict=True))) for own in lines]
+    turn = rotation.between_meridians(model.nside, model.frame, scan_frame)
     views = []
     for i, part in enumerate(model.parts):
         channel = model.survey.channels[part.channel]
@@ -125,7 +127,8 @@ def scene_of(model: Model) -> Scene:
         kernel = channel.site.beam.blm[0, : model.lmax + 1].real
         measured = part.moments.w[: model.settings.beam_orders]
         moments = np.where(np.isfinite(measured), measured, 0.0)
-        waves |= {f"orientation {s + 1}": (w.real, -w.imag) for s, w in enumerate(moments[:ORDERS])}
+        scanned = [np.exp(1j * s * turn) * w for s, w in enumerate(moments[:ORDERS], start=1)]
+        waves |= {f"orientation {s}": (w.real, -w.imag) for s, w in enumerate(scanned, start=1)}
         own = Observing(MapGrid(model.nside, model.frame, run.map.span(split)), run.map.rings(split))
         whole = replace(own, rings=None)  # as orientation moments are
         seen = _elsewhere(channel.site.pointed("elsewhere"), whole, elsewhere[part.channel]) if timed else {}
@@ -138,6 +141,7 @@ def scene_of(model: Model) -> Scene:
         splits=splits,
         foregrounds=tuple(channel.site.foregrounds for channel in model.survey.channels),
         frame=model.frame,
+        scan_frame=scan_frame,
         nside=model.nside,
         lmax=model.lmax,
         dipole_uk=np.asarray(model.survey.channels[0].site.dipole_uk),

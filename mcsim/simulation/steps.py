@@ -240,9 +240,8 @@ class Rotated(Step):
 
     def orientations(self, w: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the moments of psi from the meridians of the new frame."""
-        back = healpy.Rotator(coord=[rotation.FRAMES[self.after], rotation.FRAMES[self.before]])
-        turn = back.angle_ref(*healpy.pix2ang(self.nside, np.arange(w.shape[1])))  # from the old meridian to the new
-        return np.stack([np.exp(1j * s * turn) * self.local(row) for s, row in enumerate(w, start=1)])
+        turn = rotation.between_meridians(self.nside, self.after, self.before)
+        return np.stack([np.exp(-1j * s * turn) * self.local(row) for s, row in enumerate(w, start=1)])
 
 
 def _complete(map_uk: Map, name: str) -> Map:

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from mcsim.errors import InputError
 from mcsim.sphere import healpix
 from mcsim.sphere.checks import check_alm, check_map
-from mcsim.support.arrays import Alm, Matrix
+from mcsim.support.arrays import Alm, Matrix, Vector
 
 FRAMES = {"ecliptic": "E", "galactic": "G", "equatorial": "C"}
 
@@ -81,6 +81,18 @@ def rotate_pixels(values: NDArray, frame_from: str, frame_to: str) -> NDArray:
     """Return a HEALPix map (RING) in another frame, by the value at each pixel's centre: for masks and hits."""
     nside = check_map(values)
     return values[hp.vec2pix(nside, *(rotation_matrix(frame_to, frame_from) @ healpix.centres(nside)))]
+
+
+def between_meridians(nside: int, frame: str, other: str) -> Vector:
+    """Return the angle from south in a frame to south in another one, towards east, at pixel centres, radians, (npix,).
+
+    An angle psi from the meridian of the frame is less by it from that of the other one.
+    """
+    n = healpix.centres(nside)
+    pole = rotation_matrix(other, frame)[:, 2]
+    # South in the other frame is along n (n.pole) - pole; its parts along e_phi and e_theta, both times sin(theta).
+    east, south = n[1] * pole[0] - n[0] * pole[1], pole[2] - n[2] * (pole @ n)
+    return np.arctan2(east, south)
 
 
 def rotate_biposh(

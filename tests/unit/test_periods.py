@@ -80,7 +80,9 @@ def test_no_period_is_looked_for_in_a_survey_of_an_hour(spans, looked_for):
     visits = csr_matrix(np.full((spans, 12), 1.0 / spans))
     line = TimeLine.of((visits,), SPAN_S, {on: [np.ones(12)] for on in PERIODIC})
     empty = np.zeros(0)
-    scene = Scene(("W",), (None,), ("",), (True,), "ecliptic", 1, 2, np.zeros(3), empty, 1, (), (), False, (line,))
+    scene = Scene(
+        ("W",), (None,), ("",), (True,), "ecliptic", "ecliptic", 1, 2, np.zeros(3), empty, 1, (), (), False, (line,)
+    )
     assert len(scene.continua) - 1 == 2 * looked_for
     assert np.isfinite(np.log([tried for _, tried in scene.continua])).all()
 

@@ -128,3 +128,29 @@ def test_a_lobe_in_maps_without_a_dipole_has_a_direction_about_the_line_of_sight
     said = words.says(kept, np.array([0.0, 1.0]), np.eye(2), scene)
     assert "across the scan (+90°)" in said
     assert "90° from" not in said
+
+
+@pytest.mark.parametrize(
+    ("stage", "kind"), [("added", "orientation 1"), ("added", "orientation 2"), ("gain", "orientation 1")]
+)
+def test_orientations_are_counted_from_the_scan_whatever_the_frame_of_maps(stage, kind):
+    """In galactic maps they were counted from the galactic meridian, of which a spacecraft knows nothing."""
+    table = two_channels("galactic", lmax=24, nside=32, fwhm_arcmin=300.0, period_s=311.0)
+    table["map"]["frame"] = "galactic"
+    run = config.load(table)
+    model = model_of(survey(run, orders=2), DiagnosisSettings())
+    maps, scene = list(simulate.maps(model.survey, 7)), simulated_scores.scene_of(model)
+    filtered, u = wiener_filter(model, maps), simulated_scores.scores_of_maps(model, scene, maps)
+    told = ("sky and dipole" if stage == "gain" else "", "spacecraft", kind, "W1", ALIKE, None)
+    (structure,) = (one for one in structures(scene) if one.says == (stage, *told))
+    made = plugin("unlisted_1", structure, np.array([0.6, -0.8]), scene).kind()
+    assert made.frame == "ecliptic"
+    effect = config.Effect(name="unlisted_1", channel="W1", parameters={"amplitude": 1.0 if stage == "added" else 1e-3})
+    acting = survey(replace(run, effects=(effect,)), library={"unlisted_1": made})
+    both = (simulate.maps(one, 0, sky=filtered.sky) for one in (acting, survey(run)))
+    products = [(r, one - other) for r, one, other in zip(filtered.residual, *both, strict=True)]
+    size = 1.0 if stage == "added" else 1e-3
+    scale = np.sqrt(sum(r @ r * (one @ one) for r, one in products) / len(maps[0]))
+    expected = size * np.array([0.6, -0.8]) @ structure.of(u)
+    # The angle between the meridians is that at the centres of pixels.
+    assert abs(sum(r @ one for r, one in products) - expected) < 0.1 * scale

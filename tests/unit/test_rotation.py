@@ -10,7 +10,9 @@ from astropy.coordinates import SkyCoord
 from wignernj import wigner3j
 
 from mcsim.sphere import alm as alm_
+from mcsim.sphere import rotation
 from mcsim.sphere.rotation import (
+    between_meridians,
     euler_angles,
     rotate_alm,
     rotate_biposh,
@@ -132,3 +134,14 @@ def test_user_errors():
         rotation_matrix("super", "galactic")
     with refused("L=2", "d=0", "M=1"):
         rotate_biposh(np.zeros((2, 4), dtype=complex), [(2, 0, 0), (2, 2, 0)], "ecliptic", "galactic")
+
+
+@pytest.mark.parametrize(("frame", "other"), PAIRS)
+def test_meridians_of_two_frames_are_at_the_angle_of_healpy(frame, other):
+    turn = between_meridians(8, frame, other)
+    if frame == other:
+        np.testing.assert_array_equal(turn, 0.0)
+        return
+    back = hp.Rotator(coord=[rotation.FRAMES[frame], rotation.FRAMES[other]])
+    expected = -back.angle_ref(*hp.pix2ang(8, np.arange(768)))
+    np.testing.assert_allclose(np.exp(1j * turn), np.exp(1j * expected), atol=1e-12)
