@@ -116,7 +116,7 @@ class ScanParallelTransport:
     """Parallel transport: one sample at every pixel centre, at the angle ``psi0_deg`` from e_theta."""
 
     kind: Literal["parallel_transport"] = "parallel_transport"
-    psi0_deg: float = 0.0
+    psi0_deg: Annotated[float, Field(ge=-720.0, le=720.0)] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

@@ -70,6 +70,7 @@ def read_coefficients(path: Path, what: str) -> tuple[Alm, int, fits.Header]:
         if str(table.header.get("PIXTYPE", "")).strip().upper() == "HEALPIX" or not len(table.data):
             raise ValueError("it is a map" if len(table.data) else "its table has no rows")
         packed, mmax = healpy.read_alm(table, return_mmax=True)
+        table.header["COORDSYS"] = stated_frame(hdus, str(path)) or ""
         return packed, int(mmax), table.header
 
 
@@ -87,12 +88,25 @@ def frame_named(coordsys: object, where: str, key: str = "COORDSYS") -> str | No
     raise InputError(f"{where} has {key} = {coordsys!r}, but it must be E, G or C (ecliptic, galactic, equatorial).")
 
 
+def stated_frame(hdus: fits.HDUList, where: str) -> str | None:
+    """Return the frame that COORDSYS of a file's first table names, or that of its primary header; None without.
+
+    Raise InputError for a word that names none, and for two headers that contradict each other.
+    """
+    own, primary = (frame_named(one.header.get("COORDSYS"), where) for one in (first_table(hdus), hdus[0]))
+    if own and primary and own != primary:
+        raise InputError(
+            f"{where} has a table in {own} coordinates, and {primary} ones in its primary header; mend one."
+        )
+    return own or primary
+
+
 def radians(unit: str) -> float:
     """Return the factor from a unit of angle to radians; raise InputError for any other unit."""
     from astropy import units as u
 
     try:
-        return float(u.Unit(unit.strip().lower()).to(u.rad))
+        return float(u.Unit(re.sub("(?<=degree|radian|minute|second)s$", "", unit.strip().lower())).to(u.rad))
     except (ValueError, TypeError):
         raise InputError(f"the unit {unit!r} is none of angle; give rad, deg, arcmin or arcsec.") from None
 

@@ -25,7 +25,7 @@ from mcsim.sphere.checks import (
     check_whole,
     nside_of,
 )
-from mcsim.sphere.header import first_table, frame_named, opened, to_uk
+from mcsim.sphere.header import first_table, opened, stated_frame, to_uk
 from mcsim.support.arrays import Alm, Cl, Map, Maps, Matrix, Vector
 from mcsim.support.code import package_digest
 from mcsim.support.folders import cached, unreadable
@@ -294,7 +294,8 @@ def read_map(
     unit = str(keywords.get(f"TUNIT{column}", "")).strip() or None
     if str(keywords.get("TEMPTYPE", "")).strip().upper().startswith("ANT"):
         unit = f"{unit or 'K'} antenna"
-    found = frame_named(keywords.get("COORDSYS"), str(path))
+    with opened(path) as hdus:
+        found = stated_frame(hdus, str(path))
     if frame is not None and found not in (None, frame):
         raise InputError(
             f'{path} is in {found} coordinates, but it is needed in {frame} ones; set map.frame = "{found}", so that '

@@ -16,6 +16,7 @@ from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.limit import limit_moments
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.pointing import pointing
+from mcsim.instrument.scan.user_pointing import blocks_of_files
 from mcsim.simulation import convolve, rings, skies, tod
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import header, healpix, mask, rng, rotation, sky
@@ -279,6 +280,28 @@ def test_maps_of_both_orders_and_explicit_pixels(tmp_path):
 def test_maps_that_do_not_say_what_they_are(tmp_path, keywords):
     with refused(next(iter(keywords))):
         healpix.read_map(write_map(tmp_path / "map.fits", **keywords))
+
+
+def test_a_frame_may_stand_in_the_primary_header(tmp_path):
+    """It was passed over: a galactic map or pointing was taken for that of the run."""
+    path = write_map(tmp_path / "map.fits", COORDSYS=None)
+    fits.setval(path, "COORDSYS", value="G", ext=0)
+    assert healpix.read_map(path)[1] == "galactic"
+    with refused("galactic", "ecliptic"):
+        healpix.read_map(path, frame="ecliptic")
+    fits.setval(path, "COORDSYS", value="E", ext=1)
+    with refused("galactic", "ecliptic", "primary"):
+        healpix.read_map(path)
+    alm, samples = tmp_path / "alm.fits", tmp_path / "samples.fits"
+    healpy.write_alm(alm, ALM, out_dtype=np.float64)
+    columns = [fits.Column(name=name, format="D", array=np.full(20, 0.5)) for name in ("theta", "phi", "psi")]
+    fits.BinTableHDU.from_columns(columns).writeto(samples)
+    for file in (alm, samples):
+        fits.setval(file, "COORDSYS", value="G", ext=0)
+    with refused("galactic", "ecliptic"):
+        skies.read_alm(alm, LMAX, "ecliptic")
+    with refused("galactic", "ecliptic"):
+        list(blocks_of_files(samples, "ecliptic"))
 
 
 def test_antenna_temperature_in_temptype(tmp_path):

@@ -15,7 +15,7 @@ from mcsim.instrument.scan.geometry import check_frame
 from mcsim.instrument.scan.moments import Moments
 from mcsim.instrument.scan.offsets import HIGHEST, exponents
 from mcsim.sphere.checks import nside_of
-from mcsim.sphere.header import first_table, frame_named, opened, radians
+from mcsim.sphere.header import first_table, opened, radians, stated_frame
 from mcsim.sphere.rotation import FRAMES
 from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npz
@@ -70,7 +70,7 @@ def _from_fits(path: str | Path, where: str, smax: int | None, frame: str | None
         raise InputError(f"{where} has no ORDERING; write RING there if its pixels are so, or reorder it first.")
     if str(header["ORDERING"]).strip().upper() != "RING":
         raise InputError(f"{where} has ORDERING = {header['ORDERING']!r}, but it must be RING; reorder it first.")
-    stated = frame_named(header["COORDSYS"], where) or frame
+    stated = header["COORDSYS"] or frame
     if stated is None:
         raise InputError(f"{where} has no COORDSYS; write E, G or C there.")
     if smax is None:
@@ -149,7 +149,8 @@ def _read_table(path: str | Path, where: str) -> tuple[dict[str, NDArray[np.floa
         for column in table.columns:
             if column.unit and column.name.upper() in ("DTHETA", "DPHI", *_named(HIGHEST)):
                 columns[column.name.upper()] *= _to_radians(column.name.upper(), column.unit)
-        header = {key: table.header.get(key) for key in ("NSIDE", "ORDERING", "COORDSYS")}
+        header = {key: table.header.get(key) for key in ("NSIDE", "ORDERING")}
+        header["COORDSYS"] = stated_frame(hdus, where)
     sizes = {array.size for array in columns.values()}
     if len(sizes) != 1:
         raise InputError(f"{where} has columns of different sizes {sorted(sizes)}; write it again.")

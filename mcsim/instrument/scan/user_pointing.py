@@ -16,7 +16,7 @@ from mcsim.instrument.scan.accumulate import add_sample, pixel_sums
 from mcsim.instrument.scan.offsets import add_powers, centres
 from mcsim.instrument.scan.pointing import quarter_turns, ring_pixel
 from mcsim.sphere.checks import LARGEST_ANGLE, check_nside, check_whole
-from mcsim.sphere.header import first_table, frame_named, radians
+from mcsim.sphere.header import first_table, radians, stated_frame
 from mcsim.support.compiled import njit
 from mcsim.support.folders import unreadable, user_path
 
@@ -79,7 +79,7 @@ def _columns(path: Path, frame: str) -> tuple[list[Any], list[float]]:
 
         with fits.open(path) as hdus:
             table = first_table(hdus)
-            stated = frame_named(table.header.get("COORDSYS"), f"pointing file {str(path)!r}")
+            stated = stated_frame(hdus, f"pointing file {str(path)!r}")
             if stated not in (None, frame):
                 raise InputError(
                     f"pointing file {str(path)!r} is in {stated} coordinates, the maps in {frame}; turn it."
