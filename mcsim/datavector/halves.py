@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from mcsim.datavector.null_ensemble import NullEnsemble
-from mcsim.stats.excess import HeldOut, excess, expected_fall, expected_fall_of_draw, held_out, scatter_chi2
+from mcsim.stats.excess import Frozen, HeldOut, excess, expected_fall, expected_fall_of_draw, held_out, scatter_chi2
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 
@@ -59,13 +59,16 @@ class Halves:
         scatters: Sequence[Matrix] = (),
         data: str = "",
         skies: Callable[[Fit], tuple[Matrix, Matrix] | None] | None = None,
+        shapes: Sequence[Matrix] = (),
     ) -> HeldOut:
         """Fit templates, shape (p, K), to one part, freeze the amplitudes, and measure the reduction in the other.
 
         ``respond`` returns the response of the data vector to the frozen fit, shape (p,); ``scatters`` are deviations
         of stochastic responses from their mean, shape (p, draws) each; ``data`` names the part that judges. ``skies``
         returns data vectors of the same skies without the frozen effects and with them, shape (skies, p), where these
-        scatter the data more: noise of which there is more adds to chi^2 of data that it describes rightly.
+        scatter the data more: noise of which there is more adds to chi^2 of data that it describes rightly. ``shapes``
+        are draws of the error of what each template is, shape (p, draws): that of a pattern which a part of the data
+        tells. They cost some of the fall, and what remains may have that much.
         """
         t_used, t_fresh = t[self.first], t[self.second]
         x_used, x_fresh = self.x[self.first], self.x[self.second]
@@ -86,7 +89,12 @@ class Halves:
         else:
             fall = expected_fall(self.fresh, t_fresh, frozen.amplitudes, frozen.covariance)
         pair = None if skies is None else skies(frozen)
-        return held_out(self.fresh, after, x_fresh, fall, data, (0.0, 0.0) if pair is None else self._scatter(*pair))
+        widened = (0.0, 0.0) if pair is None else self._scatter(*pair)
+        if shapes:
+            errors = sum(a * one[self.second] for a, one in zip(frozen.amplitudes, shapes, strict=True))
+            own = Frozen.of(self.fresh, t_fresh @ frozen.amplitudes, np.asarray(errors))
+            fall, widened = own.less(fall), (own.trace, own.square)
+        return held_out(self.fresh, after, x_fresh, fall, data, widened)
 
     def _scatter(self, before: Matrix, after: Matrix) -> tuple[float, float]:
         """Return the traces of the covariance that effects add to the part that judges, and of its square."""

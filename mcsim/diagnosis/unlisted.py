@@ -11,17 +11,19 @@ from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.words import refuted
 from mcsim.reconstruction.fitted_nuisances import FittedNuisances
-from mcsim.reconstruction.plugin import plugin
+from mcsim.reconstruction.plugin import Plugin, plugin
 from mcsim.reconstruction.result import Reconstructed
 from mcsim.reconstruction.scores import Scene
 from mcsim.reconstruction.search import Search
 from mcsim.reconstruction.simulated_effects import Reconstruction
 from mcsim.reconstruction.simulated_scores import scene_for, scores_of_maps, search_of, with_peaks
+from mcsim.reconstruction.structure import Structure
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit
-from mcsim.support.arrays import Vector
+from mcsim.support.arrays import Matrix, Vector
 
 LARGEST = 2.0  #: amplitude in a part of the data over that in all scores, at most; the least is none
+SHAPES = 12  #: draws of the error of a pattern that a part of the data tells
 
 HIDDEN = (
     "What is missing was looked for in maps in which {} may have any of the values that the model allows: only what is "
@@ -73,22 +75,25 @@ def reduction_of(data: ObservedMaps, made: Reconstruction, chosen: Sequence[int]
     one half structures look alike that do not in both. Of others, and of patterns that act on few modes, the shape is
     that of all data. The amplitudes are those that fit the elements of the first fold of the data vector, up to
     :data:`LARGEST` times that of the scores: what else these elements hold, as a pattern's finer structure, would be
-    put down to them, and powers grow faster than in proportion.
+    put down to them, and powers grow faster than in proportion. A shape that is fitted to one fold has an error there:
+    what half a year hardly tells from the sky, the other half and the two together may.
     """
     _, plugins, rest = made.fitted(chosen)
     acting = [(made.search.grammar[k], one) for k, one in zip(chosen, plugins, strict=True) if one is not None]
     if plugins[0] is None:  # the others are what it leaves
         return None
     folds = [view.split % 2 for view in made.scene.views]
-    first = []
+    first, known = list[Plugin](), list[tuple[Structure, Matrix] | None]()
     for structure, effect in acting:
+        known.append(None)
         by_map = structure.views and not structure.by_coordinate and structure.stage != "noise"
         if by_map and len(made.scene.splits) > 1:
             if not len((half := structure.within(0, folds)).weights):
                 return None
             own = made.x if len(chosen) == 1 else rest + made.made([effect])
-            ((theta, _),) = made.search.fit([half], own)
-            effect = plugin(effect.name, structure, theta, made.scene) or effect
+            ((theta, covariance),) = made.search.fit([half], own)
+            if (own_effect := plugin(effect.name, structure, theta, made.scene)) is not None:
+                effect, known[-1] = own_effect, (structure, covariance) if structure.size > 1 else None
         first.append(effect)
     t = np.stack([made.simulated([one], tested=True).x - made.before.x for one in first], axis=1)
     if (apart := data.in_halves(t.sum(axis=1))) is None:
@@ -99,4 +104,17 @@ def reduction_of(data: ObservedMaps, made: Reconstruction, chosen: Sequence[int]
         scaled = [one.scaled(float(a)) for one, a in zip(first, frozen.amplitudes, strict=True)]
         return np.asarray(matrix @ (made.simulated(scaled, tested=True).x - made.before.x))
 
-    return replace(halves, largest=LARGEST).reduction(matrix @ t, respond, (), words)
+    none = np.zeros((len(t), SHAPES))
+    errors = [none if own is None else _errors(made, one.name, *own) for one, own in zip(first, known, strict=True)]
+    shapes = [matrix @ one for one in errors] if any(known) else []
+    return replace(halves, largest=LARGEST).reduction(matrix @ t, respond, (), words, shapes=shapes)
+
+
+def _errors(made: Reconstruction, name: str, structure: Structure, covariance: Matrix) -> Matrix:
+    """Return what draws of the error of a pattern's coordinates make of the data vector, shape (p, SHAPES)."""
+    sizes, axes = np.linalg.eigh(covariance)
+    normal = np.random.default_rng(0).normal(size=(SHAPES, len(sizes)))
+    drawn = normal @ (axes * np.sqrt(np.maximum(sizes, 0.0))).T
+    plugins = [effect for one in drawn if (effect := plugin(name, structure, one, made.scene)) is not None]
+    before = made.simulated([], tested=True, skies=1).x
+    return np.stack([made.simulated([one], tested=True, skies=1).x - before for one in plugins], axis=1)

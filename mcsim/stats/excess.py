@@ -135,6 +135,34 @@ def expected_fall(test: SimulatedGaussian, t: Matrix, amplitudes: Vector, covari
     return Measured(delta_chi2, float(np.sqrt(variance)))
 
 
+@dataclass(frozen=True)
+class Frozen:
+    """Hold what errors of a frozen change of the data vector add: their covariance V in a null distribution F.
+
+    ``trace`` is tr(F V), ``square`` tr(F V F V), and ``along`` c'F V F c of the change c itself.
+    """
+
+    trace: float = 0.0
+    square: float = 0.0
+    along: float = 0.0
+
+    @classmethod
+    def of(cls, test: SimulatedGaussian, change: Vector, draws: Matrix) -> "Frozen":
+        """Take it from independent draws of the errors, shape (p_test, n), n > 1, of a change of shape (p_test,)."""
+        white, count = np.sqrt(test.hartlap_factor) * test.whiten_templates(draws), draws.shape[1]
+        gram = white.T @ white
+        sizes = np.diag(gram)
+        square = (float(np.sum(gram**2)) - float(np.sum(sizes**2))) / (count * (count - 1.0))
+        trace = float(np.mean(sizes))
+        own = np.sqrt(test.hartlap_factor) * test.whiten_templates(change[:, None])[:, 0]
+        return cls(trace, max(square, trace**2 / max(test.dimension, 1)), float(np.mean((own @ white) ** 2)))
+
+    def less(self, fall: Measured) -> Measured:
+        """Return the fall of chi^2 to expect of fresh data, less what the errors cost: twice, as in the estimate."""
+        sigma = np.sqrt(fall.sigma**2 + 4.0 * self.along + 4.0 * self.square)
+        return Measured(fall.value - 2.0 * self.trace, float(sigma))
+
+
 def expected_fall_of_draw(
     wide: SimulatedGaussian, t: Matrix, covariance: Matrix, seen: Measured, shares: Vector
 ) -> Measured:
