@@ -56,9 +56,9 @@ def compare(
     ----------
     a, b
         Two sides: folders with ``{channel}.fits`` or ``{channel}_{split}.fits``, HEALPix, uK or the unit of their
-        headers, without noise or with the same noise, or with a subfolder of these for each realization, of which the
-        first is compared; configurations, of which realization 0 is simulated; or arrays, shape (npix,) each, by name
-        ("channel" or "channel:split") or in the order of the model's maps.
+        headers, without noise or with the same noise, or with a subfolder of these for each realization, of which 00000
+        is compared; configurations with the same sky, of which realization 0 is simulated; or arrays, shape (npix,)
+        each, by name ("channel" or "channel:split") or in the order of the model's maps.
     model
         Run that describes side A: beams, scans, nside, lmax; by default side A if it is a configuration, or
         ``model.toml`` in its folder; else the same of side B, which then describes that; else ``model.toml`` beside

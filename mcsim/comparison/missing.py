@@ -7,6 +7,8 @@ from pathlib import Path
 from mcsim import config
 from mcsim.comparison.result import NotCompared
 from mcsim.ensemble.maps import file_names, first_realization
+from mcsim.errors import InputError
+from mcsim.sphere import spectra
 
 
 def not_compared(
@@ -35,6 +37,28 @@ def warn_of_effects(run: config.RunConfig) -> None:
             "side.",
             stacklevel=4,
         )
+
+
+def check_skies(a: str | Path, b: str | Path) -> None:
+    """Raise InputError for two descriptions that draw different skies; those of stored maps have one of their own."""
+    here, there = (config.load(side) for side in (a, b))
+    if any(run.ensemble.maps is not None for run in (here, there)):
+        return
+    keys: dict[str, list[object]] = {"sky.lmax": [run.sky.lmax for run in (here, there)]}
+    if all(run.sky.alm is None and run.sky.map is None for run in (here, there)):
+        keys |= {"sky.spectrum": [_spectrum(run) for run in (here, there)]}
+        keys |= {"ensemble.seed": [run.ensemble.seed for run in (here, there)]}
+    for key, (one, other) in keys.items():
+        if one != other:
+            values = f" = {one} and {other}" if isinstance(one, int) else ""
+            raise InputError(
+                f"{a} and {b} have different skies ({key}{values}), and a comparison is one of the same sky; give both "
+                "the same [sky] and ensemble.seed."
+            )
+
+
+def _spectrum(run: config.RunConfig) -> bytes:
+    return b"" if run.sky.spectrum is None else spectra.load(run.sky.spectrum, run.sky.lmax).tobytes()
 
 
 def _lacking(wanted: Sequence[str], a: set[str], b: set[str]) -> Iterator[NotCompared]:

@@ -18,7 +18,7 @@ from mcsim.comparison.description import (
     with_known_offsets,
     with_own_beams,
 )
-from mcsim.comparison.missing import not_compared, warn_of_effects
+from mcsim.comparison.missing import check_skies, not_compared, warn_of_effects
 from mcsim.comparison.result import NotCompared
 from mcsim.comparison.scene import Maps, PointingFiles, Scene, files_of, maps_of_files, scene_of
 from mcsim.comparison.sky_of_maps import sky_in
@@ -40,6 +40,7 @@ Given = Sequence[Map] | Mapping[str, Map]
 """Maps as arrays, in the order of a run's or by name."""
 
 HELD = 20_000_000  #: the same of samples in files, which are held in memory
+CLOSER = 0.5  #: squares that all orders of a beam leave of a side, over those that a run's leave, at most
 
 _STORED = (".fits", ".fit", ".gz", ".npy", ".npz", ".h5", ".hdf5", ".nc")  #: what a file of maps is called
 
@@ -154,6 +155,8 @@ def read(
     """
     for side in (a, b):
         _check_kind(side)
+    if not Path(a).is_dir() and not Path(b).is_dir():
+        check_skies(a, b)
     run, described, of_b = _model(a, b, model)
     whole: Survey | None = None
     orders: dict[str, int] = {}
@@ -296,18 +299,16 @@ def _closer(made: dict[str, Map], wanted: dict[str, Map], side: str | Path, nthr
     """Return the maps of a run as they were made, or those that are closer to the other side's, but for a factor.
 
     Orientation moments spread samples over their pixels otherwise than another simulator does, which may have all
-    orders of a beam too.
+    orders of a beam too: these are taken where they are clearly closer, for beside another difference chance decides.
     """
     run, external = _named(side)
     if external is not None:
         return made
-    full = with_all_orders(run)
-    ways = [made]
-    for one in (run, full) if full != run else (run,):
-        if one is full:
-            whole = survey(with_known_offsets(full), nthreads)
-            ways.append(dict(zip(whole.map_names, simulate.maps(whole, 0, nthreads), strict=True)))
-        exact = _by_samples(one, nthreads)
+    exact, full = _by_samples(run, nthreads), with_all_orders(run)
+    own, ways = [made] if exact is None else [made, exact], []
+    if full != run:
+        whole, exact = survey(with_known_offsets(full), nthreads), _by_samples(full, nthreads)
+        ways = [dict(zip(whole.map_names, simulate.maps(whole, 0, nthreads), strict=True))]
         ways += [] if exact is None else [exact]
 
     def distance(maps: dict[str, Map]) -> float:
@@ -321,7 +322,9 @@ def _closer(made: dict[str, Map], wanted: dict[str, Map], side: str | Path, nthr
                 total += float(np.sum((factor * here - there) ** 2))
         return total
 
-    return min(ways, key=distance)
+    best = min(own, key=distance)
+    closest = min(ways, key=distance, default=best)
+    return closest if distance(closest) < CLOSER * distance(best) else best
 
 
 def _by_samples(run: config.RunConfig, nthreads: int) -> dict[str, Map] | None:

@@ -17,6 +17,12 @@ class _Masked:
     mask_frame: Frame | None = None
     channels: tuple[Label, ...] = ()
 
+    @model_validator(mode="after")
+    def _frame_of_a_mask(self) -> Self:
+        if self.mask is None and self.mask_frame is not None:
+            raise ValueError("mask_frame is given without a mask; name the mask, or remove mask_frame")
+        return self
+
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Degrade:
@@ -111,6 +117,12 @@ class Fill(_Masked):
     kind: Literal["fill"] = "fill"
     method: Literal["diffuse", "constant"] = "diffuse"
     value_uk: float = 0.0
+
+    @model_validator(mode="after")
+    def _value_of_a_constant(self) -> Self:
+        if self.method == "diffuse" and self.value_uk != 0.0:
+            raise ValueError('value_uk is given, but method = "diffuse" takes means; set method = "constant"')
+        return self
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

@@ -24,6 +24,8 @@ from mcsim.support.folders import appearing, not_filled, unwritable, user_path, 
 SMALLEST_RMS = 2e-3
 """Rms of an observed map over that of the sky of the run, at least: above a map in mK or K that is taken for uK."""
 
+ZEROS = 0.01  #: share of the pixels of an observed map that may be exactly 0: more were not observed
+
 Source = str | Path | Mapping[str, Any] | config.RunConfig
 
 
@@ -99,6 +101,12 @@ def _prepared(run: config.RunConfig, name: str, map_: ArrayLike) -> Map:
     given = reals(map_, f"map {name}", healpy.UNSEEN)
     check_map(given, run.map.resolution, f"map {name}")
     check_not_infinite(given, f"map {name}")
+    zeros, seen = int(np.sum(given == 0.0)), int(np.sum(given > UNSEEN_BELOW))
+    if ZEROS * seen < zeros < seen:  # a map of zeros has no rms
+        raise InputError(
+            f"map {name} is exactly 0 in {zeros} pixels, which the steps would take for data; mark what was not "
+            "observed as UNSEEN."
+        )
     steps = preparation(run, spec, split, observed=True)
     assert steps is not None  # the run has steps
     prepared = steps.apply(given)

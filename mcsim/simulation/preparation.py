@@ -246,7 +246,10 @@ def _step(step: declared.OtherStep, spec: config.Channel, split: str | None, nsi
     def mask(path: str | None, mask_frame: str | None) -> Map:
         if path is None:
             return np.ones(12 * nside**2)
-        return kept_mask(config.channel_path(path, spec.name, split), nside, frame, mask_frame)
+        kept = kept_mask(config.channel_path(path, spec.name, split), nside, frame, mask_frame)
+        if not kept.any():
+            raise InputError(f"the mask {path!r} is 0 in every pixel, which leaves nothing; give another one.")
+        return kept
 
     match step:
         case declared.Degrade(method="average"):

@@ -62,7 +62,8 @@ class Site:
         if self.pointing is None:
             raise InputError(
                 f"effect {effect} on channel {self.channel} depends on when and how the survey was pointed; give the "
-                'channel a scan of kind "hit_averaged", or moments with a scan model (scan.model).'
+                "channel one line of sight (scan.line_of_sight), the same in all splits, in a scan of kind "
+                '"hit_averaged", or in moments with a scan model (scan.model).'
             )
         return self.pointing
 

@@ -391,6 +391,8 @@ def test_a_sky_that_is_accepted_and_still_too_small_is_told():
         ),
         ({"kind": "subtract_dipole", "monopole": False, "dipole": False}, ("monopole", "dipole")),
         ({"kind": "mask"}, ("preparation[0].mask",)),
+        ({"kind": "subtract_dipole", "mask_frame": "galactic"}, ("mask_frame",)),
+        ({"kind": "fill", "value_uk": 3.0}, ("value_uk", "diffuse")),
         ({"kind": "sharpen"}, ("degrade", "rotate")),
     ],
 )
@@ -415,6 +417,8 @@ def test_declared_steps_that_cannot_be_are_refused(step, named):
         ([{"kind": "subtract_dipole"}], np.zeros(48), ("nside 2", 32)),
         ([{"kind": "degrade", "nside": 8}], np.where(Z > 0.99, np.inf, X), ("V", np.sum(Z > 0.99), "UNSEEN")),
         ([{"kind": "degrade", "nside": 8}], np.where(Z > 0.99, -np.inf, X), ("V", np.sum(Z > 0.99), "UNSEEN")),
+        ([{"kind": "degrade", "nside": 8}], np.where(Z > 0.9, 0.0, X), ("V", np.sum(Z > 0.9) + 0, "UNSEEN")),
+        ([{"kind": "mask", "mask": np.zeros(NPIX)}], X, ("mask", "preparation[0]")),
         ([], X, ("prepared", "[[preparation]]")),
     ],
 )
