@@ -18,6 +18,7 @@ from mcsim.reconstruction.search import Search
 from mcsim.reconstruction.simulated_effects import Reconstruction
 from mcsim.reconstruction.simulated_scores import scene_for, scores_of_maps, search_of, with_peaks
 from mcsim.reconstruction.structure import Structure
+from mcsim.stats.empirical_bayes import shrunk
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Matrix, Vector
@@ -76,7 +77,8 @@ def reduction_of(data: ObservedMaps, made: Reconstruction, chosen: Sequence[int]
     that of all data. The amplitudes are those that fit the elements of the first fold of the data vector, up to
     :data:`LARGEST` times that of the scores: what else these elements hold, as a pattern's finer structure, would be
     put down to them, and powers grow faster than in proportion. A shape that is fitted to one fold has an error there:
-    what half a year hardly tells from the sky, the other half and the two together may.
+    what half a year hardly tells from the sky, the other half and the two together may. Of a pattern on the sky such
+    coefficients are taken for small.
     """
     _, plugins, rest = made.fitted(chosen)
     acting = [(made.search.grammar[k], one) for k, one in zip(chosen, plugins, strict=True) if one is not None]
@@ -92,6 +94,8 @@ def reduction_of(data: ObservedMaps, made: Reconstruction, chosen: Sequence[int]
                 return None
             own = made.x if len(chosen) == 1 else rest + made.made([effect])
             ((theta, covariance),) = made.search.fit([half], own)
+            if structure.frame == "sky":  # coefficients of one pattern, most of which are of a size
+                theta, covariance = shrunk(theta, covariance)
             if (own_effect := plugin(effect.name, structure, theta, made.scene)) is not None:
                 effect, known[-1] = own_effect, (structure, covariance) if structure.size > 1 else None
         first.append(effect)

@@ -1,8 +1,9 @@
 """Mean BipoSH of a survey's maps: of their signal, of their circular-beam control, and of their noise."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -221,16 +222,29 @@ def _scattered(cl: Cl, x: Map, y: Map, lmax: int, beyond: int = -1) -> Cl:
     It is not divided by <W_x W_y>.
     """
     top = min(3 * nside_of(x.size, "a weight") - 1, lmax + len(cl) - 1)
-    one, two = (_harmonics(np.asarray(w, dtype=np.float64).tobytes(), top) for w in (x, y))
-    weights = by_degree(one, two, top) / (2.0 * np.arange(top + 1) + 1.0)
+    weights = _cross_spectrum(_Weight.of(x), _Weight.of(y), top).copy()
     weights[: beyond + 1] = 0.0
     return pseudo_spectrum(cl, weights, lmax)
 
 
-@lru_cache(maxsize=4)
-def _harmonics(weight: bytes, top: int) -> NDArray[np.complex128]:
-    """Return a_lm of the bytes of a weight; the last ones are kept, for maps have few weights."""
-    return healpix.analysis(np.frombuffer(weight), top, iterations=3)
+@dataclass(frozen=True)
+class _Weight:
+    """A weight of pixels, known by its content: many maps have the same."""
+
+    digest: bytes
+    values: Map = field(compare=False)
+
+    @classmethod
+    def of(cls, weight: Map) -> "_Weight":
+        return cls(blake2b(np.ascontiguousarray(weight).data).digest(), weight)
+
+
+@lru_cache(maxsize=64)
+def _cross_spectrum(x: _Weight, y: _Weight, top: int) -> Cl:
+    """Return the cross spectrum of two weights, shape (top + 1,)."""
+    one = healpix.analysis(x.values, top, iterations=3)
+    two = one if x == y else healpix.analysis(y.values, top, iterations=3)
+    return np.asarray(by_degree(one, two, top) / (2.0 * np.arange(top + 1) + 1.0))
 
 
 def held(weight: Map, L_max: int) -> Cl:
