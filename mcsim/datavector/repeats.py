@@ -11,10 +11,11 @@ REPEATS = 1e-6
 """Rms difference over the rms up to which two maps or data vectors are the same: threads add numbers in any order."""
 
 FAR = 40.0
-"""Largest distance of a realization from the median of an element, in its scatter by the median distance, or 2 sqrt(N)
-of N if that is less. Models of ours have 15 at most, of 300: the tails of products of sky and noise. A map of another
-sky in one to ten of 300 makes 200 and more.
+"""Largest distance of a realization from the median of an element, in its scatter by the median distance. Models of
+ours have 15 at most, of 300: the tails of products of sky and noise. A map of another sky in one to ten makes 200.
 """
+
+ALONE = 0.8  #: share of the variance that one may make, of an element that is the same in half of the realizations
 
 SIGMA = 1.4826  #: standard deviation over the median distance from the median, of a Gaussian
 
@@ -44,14 +45,15 @@ def check_alike(rows: Matrix, source: Source, seed: int) -> None:
     In the covariance of a sample with some of them nothing departs from the model any more.
     """
     distances = np.abs(rows - np.median(rows, axis=0))
-    far = divided(distances, SIGMA * np.median(distances, axis=0)).max(axis=1)
-    limit = min(FAR, 2.0 * np.sqrt(len(rows)))
-    worst, others = int(far.argmax()), int(np.sum(far > limit)) - 1
-    if far[worst] > limit:
+    scatter, squares = SIGMA * np.median(distances, axis=0), (rows - rows.mean(axis=0)) ** 2
+    same = np.where(divided(squares, squares.sum(axis=0)) > ALONE, np.inf, 0.0)
+    far = np.where(scatter > 0.0, divided(distances, scatter), same).max(axis=1)
+    worst, others = int(far.argmax()), int(np.sum(far > FAR)) - 1
+    if far[worst] > FAR:
         beside, them = (f" and {others} more are", "their") if others else (" is", "its")
         raise InputError(
             f"{source.words(seed, worst)}{beside} none like the others of {len(rows)}: up to {far[worst]:.3g} times "
-            f"the scatter of what is measured away from their median, where {limit:.3g} are the most; see if {them} "
+            f"the scatter of what is measured away from their median, where {FAR:g} are the most; see if {them} "
             f"maps are of one sky and of this survey, or leave {'them' if others else 'it'} out."
         )
 

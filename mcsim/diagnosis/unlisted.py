@@ -94,7 +94,7 @@ def reduction_of(data: ObservedMaps, made: Reconstruction, chosen: Sequence[int]
                 return None
             own = made.x if len(chosen) == 1 else rest + made.made([effect])
             ((theta, covariance),) = made.search.fit([half], own)
-            if structure.frame == "sky":  # coefficients of one pattern, most of which are of a size
+            if structure.frame == "sky" and structure.size > 1:  # coefficients of one pattern, which are of one size
                 theta, covariance = shrunk(theta, covariance)
             if (own_effect := plugin(effect.name, structure, theta, made.scene)) is not None:
                 effect, known[-1] = own_effect, (structure, covariance) if structure.size > 1 else None

@@ -34,7 +34,7 @@ from mcsim.simulation.survey import Channel, Survey, SurveyMap
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.checks import nside_of
-from mcsim.support.arrays import Cl, Map, divided
+from mcsim.support.arrays import Alm, Cl, Map, divided
 
 Source = str | Path | Mapping[str, Any] | config.RunConfig | Survey
 
@@ -43,6 +43,8 @@ L_MOMENTS = 64  #: highest degree of the orientation moments in predictions to a
 L_WEIGHTS, SHARE, SCATTERED = range(64, 193, 32), 0.99, 0.01
 """Highest degrees of moments times weights, of which the first is taken that holds a share of the weights' square, and
 beyond which weights scatter at most another share of the spectrum into any degree."""
+
+ROUNDING = 1e-14  #: of the power of a weight, or of a spectrum: what is less is an error of the analysis
 
 FOLDED = 0.1  #: of prepared noise at the highest l: what averages fold into it from beyond the degrees of their pixels
 EVEN, MOVED = 1e-6, 0.01
@@ -204,9 +206,10 @@ def _degrees_for(survey: Survey, m: SurveyMap, channel: Channel) -> int:
     assert m.weight is not None  # the caller looked
     cl = spectrum(survey) * circular_window(survey, channel) ** 2
     whole = _scattered(cl, m.weight, m.weight, survey.lmax)
+    least = ROUNDING * whole.max()
     near = range(_degrees_of(m.weight), L_WEIGHTS[-1], L_WEIGHTS.step)
     beyond = ((L, _scattered(cl, m.weight, m.weight, survey.lmax, L)) for L in near)
-    return next((L for L, less in beyond if np.all(less <= SCATTERED * whole)), L_WEIGHTS[-1])
+    return next((L for L, less in beyond if np.all(less <= SCATTERED * whole + least)), L_WEIGHTS[-1])
 
 
 def circular_window(survey: Survey, channel: Channel) -> Cl:
@@ -216,13 +219,15 @@ def circular_window(survey: Survey, channel: Channel) -> Cl:
     return np.asarray(ScannedBeam(beam, none).response(len(spectrum(survey)) - 1)[0].real)
 
 
-def _scattered(cl: Cl, x: Map, y: Map, lmax: int, beyond: int = -1) -> Cl:
+def _scattered(cl: Cl, x: Map, y: Map, lmax: int, beyond: int = -1, nthreads: int = 1) -> Cl:
     """Return the cross spectrum of an isotropic sky in two weights, (lmax + 1,), by their degrees beyond a given one.
 
     It is not divided by <W_x W_y>.
     """
     top = min(3 * nside_of(x.size, "a weight") - 1, lmax + len(cl) - 1)
-    weights = _cross_spectrum(_Weight.of(x), _Weight.of(y), top).copy()
+    one, two = (_harmonics(_Weight.of(weight), top, nthreads) for weight in (x, y))
+    weights = by_degree(one, two, top) / (2.0 * np.arange(top + 1) + 1.0)
+    weights[np.abs(weights) < ROUNDING * np.abs(weights).max()] = 0.0
     weights[: beyond + 1] = 0.0
     return pseudo_spectrum(cl, weights, lmax)
 
@@ -239,12 +244,18 @@ class _Weight:
         return cls(blake2b(np.ascontiguousarray(weight).data).digest(), weight)
 
 
-@lru_cache(maxsize=64)
-def _cross_spectrum(x: _Weight, y: _Weight, top: int) -> Cl:
-    """Return the cross spectrum of two weights, shape (top + 1,)."""
-    one = healpix.analysis(x.values, top, iterations=3)
-    two = one if x == y else healpix.analysis(y.values, top, iterations=3)
-    return np.asarray(by_degree(one, two, top) / (2.0 * np.arange(top + 1) + 1.0))
+@lru_cache(maxsize=4)
+def _harmonics(weight: _Weight, top: int, nthreads: int) -> Alm:
+    """Return a_lm of a weight; the last ones are kept.
+
+    Those beyond 2 nside have errors of 1e-5, and are none where the weight has ended before.
+    """
+    clean = min(top, 2 * nside_of(weight.values.size, "a weight"))
+    alm = healpix.analysis(weight.values, clean, iterations=3, nthreads=nthreads)
+    power = by_degree(alm, alm, clean)
+    if power[clean - clean // 4 :].max() < ROUNDING * power.max():
+        return alm_.resize(alm, clean, top)
+    return healpix.analysis(weight.values, top, iterations=3, nthreads=nthreads)
 
 
 def held(weight: Map, L_max: int) -> Cl:
@@ -273,18 +284,20 @@ def signal(
     weights = [np.ones(1) if (w := _weighted(survey, survey.maps[i]).weight) is None else w for i in pair]
     if (0, 0, 0) in modes and x.weighted and y.weighted:
         ell = np.arange(survey.lmax + 1)
-        further = _further(survey, (x, y), pair, min(x.L_max, y.L_max))
+        further = _further(survey, (x, y), pair, min(x.L_max, y.L_max), nthreads)
         found[list(modes).index((0, 0, 0))] += (-1.0) ** ell * np.sqrt(2.0 * ell + 1.0) * further
     return without_windows(survey, found / np.mean(weights[0] * weights[1]), modes, pair)
 
 
-def _further(survey: Survey, beams: tuple[ScannedBeam, ScannedBeam], pair: tuple[int, int], beyond: int) -> Cl:
+def _further(
+    survey: Survey, beams: tuple[ScannedBeam, ScannedBeam], pair: tuple[int, int], beyond: int, nthreads: int
+) -> Cl:
     """Return the cross spectrum that two weights scatter by degrees beyond those of the moments."""
     cl = spectrum(survey)
     for beam in beams:
         cl = cl * beam.circular.response(len(cl) - 1)[0].real
     weights = [w for i in pair if (w := survey.maps[i].weight) is not None]
-    return _scattered(cl, weights[0], weights[-1], survey.lmax, beyond)
+    return _scattered(cl, weights[0], weights[-1], survey.lmax, beyond, nthreads)
 
 
 def beyond_moments(survey: Survey, number: int, L_moments: int) -> Cl:

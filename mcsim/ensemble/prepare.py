@@ -101,14 +101,14 @@ def _prepared(run: config.RunConfig, name: str, map_: ArrayLike) -> Map:
     given = reals(map_, f"map {name}", healpy.UNSEEN)
     check_map(given, run.map.resolution, f"map {name}")
     check_not_infinite(given, f"map {name}")
-    zeros, seen = int(np.sum(given == 0.0)), int(np.sum(given > UNSEEN_BELOW))
-    if ZEROS * seen < zeros < seen:  # a map of zeros has no rms
+    steps = preparation(run, spec, split, observed=True)
+    assert steps is not None  # the run has steps
+    zeros, seen = int(np.sum(steps.used(given.size) & (given == 0.0))), int(np.sum(given > UNSEEN_BELOW))
+    if zeros > ZEROS * seen and given.any():  # a map of zeros has no rms
         raise InputError(
             f"map {name} is exactly 0 in {zeros} pixels, which the steps would take for data; mark what was not "
             "observed as UNSEEN."
         )
-    steps = preparation(run, spec, split, observed=True)
-    assert steps is not None  # the run has steps
     prepared = steps.apply(given)
     _check_rms(run, given[given > UNSEEN_BELOW], f"map {name}")
     return prepared

@@ -101,6 +101,21 @@ class Preparation:
         """Return the product of the masks after the first step in harmonics, as :meth:`weight` does."""
         return Preparation(self.steps[self.filtering :], self.nside, self.frame).weight()
 
+    def used(self, npix: int) -> NDArray[np.bool_]:
+        """Return the pixels of given maps, shape (npix,), whose values count: not those that are hidden first."""
+        hidden, used = np.zeros((2, npix), dtype=bool)
+        for step in self.steps:
+            match step:
+                case Weighted():
+                    hidden = hidden | (step.mask == 0.0)
+                case Filled():
+                    hidden = hidden | step.masked
+                case Regression():
+                    used = used | ((step.weight > 0.0) & ~hidden)
+                case _:
+                    break
+        return used | ~hidden
+
     def noise_band(self, fine: int) -> float:
         """Return the variance of the noise over its local power, 1/sr, of maps made at nside ``fine``."""
         if not self.transforms:

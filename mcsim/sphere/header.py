@@ -106,7 +106,7 @@ def radians(unit: str) -> float:
     from astropy import units as u
 
     try:
-        return float(u.Unit(re.sub("(?<=degree|radian|minute|second)s$", "", unit.strip().lower())).to(u.rad))
+        return float(u.Unit(re.sub("^(deg|rad|arc)(.*)s$", r"\1\2", unit.strip().lower())).to(u.rad))
     except (ValueError, TypeError):
         raise InputError(f"the unit {unit!r} is none of angle; give rad, deg, arcmin or arcsec.") from None
 

@@ -82,3 +82,17 @@ def test_nothing_is_said_where_little_is_scattered(changes: dict[str, Any]) -> N
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         mcsim.predict(run(**changes))
+
+
+@pytest.mark.parametrize("fwhm_arcmin", [60.0, 600.0])
+def test_a_mask_of_two_degrees_scatters_nothing_further(fwhm_arcmin: float) -> None:
+    """Rounding of its harmonics was power of the sky, of either sign, and was refused or warned of."""
+    height = healpy.pix2vec(NSIDE, np.arange(12 * NSIDE**2))[2]
+    smooth = run(mask=(1.0 + 0.1 * height) / 1.1)
+    beam = replace(smooth.channels[0], beam=config.BeamGaussian(fwhm_arcmin=fwhm_arcmin))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", "the mask .* of other degrees")  # of the next one, which is far brighter
+        found = mcsim.predict(replace(smooth, channels=(beam,)))
+    assert "L = 64" in found.attrs["mask"]
+    assert np.all(found.cl_mean.values[0] >= 0.0)

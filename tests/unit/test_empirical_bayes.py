@@ -25,6 +25,20 @@ def test_what_is_hardly_measured_is_small_and_the_rest_stays():
     assert np.mean(said) == pytest.approx(np.mean(after), rel=0.15)
 
 
+def test_one_bad_number_does_not_hide_the_size_of_the_others():
+    found, error = shrunk(np.array([1.0, -1.0, 1.0, 1e4]), np.diag([0.01, 0.01, 0.01, 1e8]))
+    np.testing.assert_allclose(found, [1.0, -1.0, 1.0, 0.0], atol=0.02)
+    assert np.all(np.diag(error) < 5.0)
+
+
+def test_faint_numbers_keep_the_size_of_the_whole():
+    """Along itself the estimate is as large as before."""
+    estimates, covariance = np.array([0.5, -0.7, 0.6]), np.diag([1.0, 1.0, 4.0])
+    found, _ = shrunk(estimates, covariance)
+    precision = np.linalg.inv(covariance)
+    assert found @ precision @ estimates == pytest.approx(found @ precision @ found)
+
+
 def test_exact_and_absent_numbers_stay_as_they_are():
     estimates = np.array([1.0, -2.0, 0.5])
     found, error = shrunk(estimates, np.zeros((3, 3)))

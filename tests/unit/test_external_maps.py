@@ -126,6 +126,12 @@ def test_a_realization_with_a_map_of_another_is_not_taken_into_the_covariance() 
     rows[7, 2] = 50.0
     with refused(7, 300):
         check_alike(rows, source, 0)
+    few = np.random.default_rng(4).standard_normal((2, 60, 50)).prod(axis=0)  # tails of products, of few
+    check_alike(few, source, 0)
+    few[:, 7] = 0.0
+    few[5, 7] = 1e-9
+    with refused(5, 60):
+        check_alike(few, source, 0)
     rows[20::30, 2] = 50.0  # ten of them, none of which makes much of the variance
     with refused(10, 300):
         check_alike(rows, source, 0)

@@ -427,6 +427,21 @@ def test_maps_and_steps_that_do_not_fit_are_refused(steps, map_uk, named):
         mcsim.prepare([map_uk], run_with(*steps))
 
 
+@pytest.mark.parametrize(
+    "steps",
+    [
+        [{"kind": "mask", "mask": BAND}],
+        [{"kind": "fill", "mask": BAND}, {"kind": "degrade", "nside": 8}],
+        [{"kind": "subtract_dipole", "mask": BAND}, {"kind": "mask", "mask": BAND}],
+    ],
+)
+def test_zeros_that_steps_hide_are_no_data(steps):
+    """Maps that were multiplied by the mask that the first steps have."""
+    run, map_uk = run_with(*steps), np.where(BAND > 0.0, 100.0 + 30.0 * X, 0.0)
+    there = np.where(BAND > 0.0, map_uk, 55.0)
+    np.testing.assert_allclose(mcsim.prepare([map_uk], run)[0], mcsim.prepare([there], run)[0], atol=1e-9)
+
+
 def test_files_are_prepared(tmp_path, rng):
     run = run_with({"kind": "degrade", "nside": COARSE})
     map_uk = rng.standard_normal(NPIX)

@@ -6,6 +6,8 @@ import numpy as np
 from mcsim.bipolar.theory.harmonics import spin_functions
 from mcsim.support.arrays import Cl
 
+ROUNDING = 1e-14  #: error of a sum over its terms
+
 
 def pseudo_spectrum(cl: Cl, weights: Cl, lmax: int) -> Cl:
     """Return sum_l' (2l'+1)/4pi C_l' sum_L (2L+1) W_L (l l' L; 0 0 0)^2, uK^2, shape (lmax + 1,).
@@ -24,4 +26,7 @@ def pseudo_spectrum(cl: Cl, weights: Cl, lmax: int) -> Cl:
     functions = spin_functions(0, top, theta)[0]
     norm = np.sqrt(4.0 * np.pi / (2.0 * np.arange(top + 1) + 1.0))
     sky, weight = ((one / norm[: len(one)]) @ functions[: len(one)] for one in (cl, weights))
-    return np.asarray(norm[: lmax + 1] * (functions[: lmax + 1] @ (share * sky * weight)))
+    product = share * sky * weight
+    found = norm[: lmax + 1] * (functions[: lmax + 1] @ product)
+    # What is left of a sum by rounding has either sign.
+    return np.where(np.abs(found) > ROUNDING * np.sum(np.abs(product)), found, 0.0)
