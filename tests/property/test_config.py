@@ -34,7 +34,7 @@ def ellipticals(draw):
 BEAMS = st.fixed_dictionaries({"kind": st.just("gaussian"), "fwhm_arcmin": POSITIVE}) | ellipticals()
 # Any existing file will do for the keys that name files: this one.
 SCANS = (
-    st.fixed_dictionaries({"kind": st.just("parallel_transport")}, optional={"psi0_deg": ANGLES})
+    st.fixed_dictionaries({"kind": st.just("parallel_transport")}, optional={"psi0_deg": st.floats(-720.0, 720.0)})
     | st.fixed_dictionaries({"kind": st.just("moments"), "path": st.just(__file__)})
     | st.fixed_dictionaries(
         {"kind": st.just("hit_averaged"), "model": st.just(__file__)},
