@@ -1,4 +1,4 @@
-"""What a comparison leaves out: maps that one side alone has, or that no model describes, and effects of the model."""
+"""What a comparison cannot compare: maps of one side alone or of no model, effects of the model, different skies."""
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
