@@ -19,7 +19,7 @@ from mcsim.bipolar.theory import (
     signal_to_noise,
 )
 from mcsim.ensemble import plan, summary
-from mcsim.ensemble.expectation import L_WEIGHTS, Means, circular_window, spectrum
+from mcsim.ensemble.expectation import L_WEIGHTS, Means, circular_spectrum
 from mcsim.simulation.filtering import LOWEST
 from mcsim.simulation.survey import Survey
 from mcsim.support.arrays import divided
@@ -77,11 +77,11 @@ def scattered(survey: Survey, found: dict[tuple[int, int], Means], number: int) 
     It is what the spectrum has above that of the full sky; negative where weights take more away than they bring.
     """
     channel = next(one for one in survey.channels if survey.maps[number] in one.maps)
-    beam = (circular_window(survey, channel)[: survey.lmax + 1] / channel.window[: survey.lmax + 1]) ** 2
+    full = circular_spectrum(survey, channel)[: survey.lmax + 1] / channel.window[: survey.lmax + 1] ** 2
     own = found[number, number]
     monopole = survey.estimator.modes.index(MONOPOLE)
     there = cl_of(survey, own.circular[monopole])
-    return divided(there - spectrum(survey)[: survey.lmax + 1] * beam, there + cl_of(survey, own.noise[monopole]))
+    return divided(there - full, there + cl_of(survey, own.noise[monopole]))
 
 
 def variances_of(

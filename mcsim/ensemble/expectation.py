@@ -204,7 +204,7 @@ def _degrees_of(weight: Map) -> int:
 def _degrees_for(survey: Survey, m: SurveyMap, channel: Channel) -> int:
     """Return the first of ``L_WEIGHTS`` from ``_degrees_of`` on beyond which a map's weight scatters little power."""
     assert m.weight is not None  # the caller looked
-    cl = spectrum(survey) * circular_window(survey, channel) ** 2
+    cl = circular_spectrum(survey, channel)
     whole = _scattered(cl, m.weight, m.weight, survey.lmax)
     least = ROUNDING * whole.max()
     near = range(_degrees_of(m.weight), L_WEIGHTS[-1], L_WEIGHTS.step)
@@ -212,11 +212,12 @@ def _degrees_for(survey: Survey, m: SurveyMap, channel: Channel) -> int:
     return next((L for L, less in beyond if np.all(less <= SCATTERED * whole + least)), L_WEIGHTS[-1])
 
 
-def circular_window(survey: Survey, channel: Channel) -> Cl:
-    """Return what the round part of a channel's beam and its pixels make of a_lm, up to the degrees of the sky."""
+def circular_spectrum(survey: Survey, channel: Channel) -> Cl:
+    """Return the spectrum of the sky through the round part of a channel's beam and its pixels, uK^2."""
+    cl = spectrum(survey)
     beam = channel.beam.blm[:1] * channel.window * nearer(survey, channel)
     none = np.zeros((1, 1, 1), dtype=np.complex128)
-    return np.asarray(ScannedBeam(beam, none).response(len(spectrum(survey)) - 1)[0].real)
+    return np.asarray(cl * ScannedBeam(beam, none).response(len(cl) - 1)[0].real ** 2)
 
 
 def _scattered(cl: Cl, x: Map, y: Map, lmax: int, beyond: int = -1, nthreads: int = 1) -> Cl:
@@ -309,8 +310,7 @@ def beyond_moments(survey: Survey, number: int, L_moments: int) -> Cl:
     if weight is None:
         return np.zeros(survey.lmax + 1)
     channel = next(one for one in survey.channels if m in one.maps)
-    cl = spectrum(survey) * circular_window(survey, channel) ** 2
-    further = _scattered(cl, weight, weight, survey.lmax, L_moments)
+    further = _scattered(circular_spectrum(survey, channel), weight, weight, survey.lmax, L_moments)
     return np.asarray(further / np.mean(weight**2) / channel.window[: survey.lmax + 1] ** 2)
 
 
