@@ -67,10 +67,10 @@ class Calibration(Difference):
 
 
 class Unit(Difference):
-    """The maps of side B are in another unit."""
+    """The maps of side B are in another unit, or have the other sign."""
 
     name, unit = "unit", "factor"
-    met = "K taken for uK, or antenna for CMB temperature"
+    met = "K taken for uK, antenna for CMB temperature, or model less data for data less model"
     needs_scene = False
     exchanges = True
 
@@ -79,6 +79,7 @@ class Unit(Difference):
         size = float(np.std(state.pair.b[state.pair.seen]) / np.std(state.maps[state.pair.seen]))
         # Factors of ten are exact, whatever else differs; antenna temperature depends on the band and on T_CMB.
         near = {f for f in (1e-6, 1e-3, 1e3, 1e6) for x in (size, found) if 0.1 < x / f < 10.0}
+        near |= {-f for f in (1e-6, 1e-3, 1.0, 1e3, 1e6) if 0.1 < -found / f < 10.0}
         tens = [np.array([f]) for f in sorted(near)]
         if found <= 0.0:
             return tens
@@ -97,6 +98,10 @@ class Unit(Difference):
 
     def inverse(self, value: Vector) -> Vector:
         return 1.0 / value
+
+    def said(self, value: Vector) -> str:
+        """Return words for a negative factor."""
+        return "the other sign" if value[0] < 0.0 else ""
 
     def equivalent(self, value: Vector) -> list[tuple[str, float, str]]:
         """Return the calibration that does the same, if it could be one."""

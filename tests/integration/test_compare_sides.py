@@ -74,6 +74,17 @@ def test_a_unit_of_one_split_alone_is_named(simulator, side_a):
     assert "W1:half2; the other maps are identical" in str(found)
 
 
+@pytest.mark.parametrize(("factor", "behind"), [(-1.0, []), (-1e-6, []), (-1.0, ["psi_offset"])])
+def test_maps_of_the_other_sign_are_a_unit(factor, behind, simulator, side_a):
+    side_b = simulator(psi=lambda p: p + np.deg2rad(30.0)) if behind else side_a
+    for sides in ((side_a, scaled(side_b, factor)), (scaled(side_a, factor), side_b)):
+        found = mcsim.compare(*sides, simulator.run)
+        assert sorted(names(found)) == [*behind, "unit"]
+        unit = found.channels[0].differences[-1]
+        assert unit.amplitude == pytest.approx(factor if sides[0] is side_a else 1.0 / factor, rel=1e-9)
+        assert "the other sign" in str(found)
+
+
 @pytest.mark.parametrize("masked", [False, True])
 def test_behind_a_unit_the_same_pixels_and_splits_are_compared(tmp_path, masked, simulator, side_a):
     """Of a split alone, and of masked maps whose side B has something else behind the mask."""
