@@ -65,7 +65,7 @@ def stochastic(
 
     Notes
     -----
-    The relative error of the diagonal is about 2/number.
+    The relative error of the diagonal is about 2/number, and of several groups the root of 2 over the number of pairs.
     """
     K, group, done = len(derivatives), group_of(probes, filtered), 0.0
     found: list[Matrix] = []
@@ -87,12 +87,18 @@ def stochastic(
                 report(done)
         both = (table + np.swapaxes(table, 1, 2)) * (1.0 - np.eye(len(members)))
         each = 0.5 * np.swapaxes(both, 0, 1) @ np.moveaxis(both, 0, 2)  # of the pairs of each probe
-        found.append(each.sum(axis=0) / (len(members) * (len(members) - 1)))
+        found.append(each.sum(axis=0))
         pairs.append(both)
     first_half, second_half = zip(*(means(filtered, derivative) for derivative in derivatives), strict=True)
-    total = np.mean(found, axis=0) + _filtered_products(filtered, derivatives, first_half, second_half)
+    total = np.sum(found, axis=0) / sum(map(ordered_pairs, pairs))  # all pairs count the same, in whatever group
+    total += _filtered_products(filtered, derivatives, first_half, second_half)
     total = (total + total.T) / 2.0
     return Information(total, tuple(pairs))
+
+
+def ordered_pairs(group: NDArray[np.float64]) -> int:
+    """Return how many pairs the probes of a group make, each in both orders; ``group`` as in Information, (K, n, n)."""
+    return group.shape[1] * (group.shape[1] - 1)
 
 
 def variance_of_mean(pairs: Matrix) -> float:

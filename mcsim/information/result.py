@@ -11,7 +11,7 @@ import xarray as xr
 
 from mcsim.datavector.candidate import Candidate, columns_of, numbered
 from mcsim.ensemble.store import write_dataset
-from mcsim.information.fisher import Information, variance_of_mean
+from mcsim.information.fisher import Information, ordered_pairs, variance_of_mean
 from mcsim.information.settings import LimitSettings
 from mcsim.stats.detection import snr_needed, snr_to_separate
 from mcsim.support.arrays import Matrix, Vector, divided, texts
@@ -351,8 +351,8 @@ def _errors_of_sizes(candidates: Sequence[Candidate], information: Information, 
         typical = left[:, candidate.columns] @ candidate.typical
         for group in information.pairs:
             responses = np.tensordot(typical, group, (0, 0))
-            found[place] += variance_of_mean(0.5 * np.mean(responses**2, axis=0))
-    return np.sqrt(found) / max(len(information.pairs), 1)
+            found[place] += ordered_pairs(group) ** 2 * variance_of_mean(0.5 * np.mean(responses**2, axis=0))
+    return np.sqrt(found) / max(sum(map(ordered_pairs, information.pairs)), 1)
 
 
 def _width(candidate: Candidate, settings: LimitSettings) -> float | None:

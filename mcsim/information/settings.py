@@ -40,7 +40,8 @@ class LimitSettings:
         Highest azimuthal order of the fiducial beams in the inverse covariance, the centroids of the samples included;
         0: circular beams at pixel centres. What an effect changes has all orders in any case.
     probes
-        Number of random probes, 3 or more; the relative error of sigma is about 1/probes.
+        Number of random probes, 3 or more; the relative error of sigma is about 1/probes. Where so many sets of maps
+        exceed 1 GB, groups of them that fit are paired, and it is one over the root of twice the number of pairs.
     dense
         Compute whole matrices, without random probes: the reference for small maps.
     tolerance
