@@ -59,7 +59,8 @@ def parse_mode(name: str) -> Mode:
     except ValueError:
         raise InputError(f"{name!r} is no BipoSH mode; write it like L2M0d0.") from None
     if not (0 <= mode.M <= mode.L and abs(mode.d) <= mode.L and mode.L > 0):
-        raise InputError(f"the mode {name} does not exist; it needs L > 0, 0 <= M <= L and |d| <= L.")
+        is_cl = "is that of C_l" if mode == (0, 0, 0) else "does not exist"
+        raise InputError(f"the mode {name} {is_cl}; give one with L > 0, 0 <= M <= L and |d| <= L.")
     return mode
 
 

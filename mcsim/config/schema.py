@@ -246,7 +246,7 @@ class Biposh:
     """Settings of the estimator; ``lmax``: by default the sky's; ``iterations``: Jacobi iterations of the analysis.
 
     ``filter``: "inverse_covariance" estimates from maps filtered by their inverse covariance, which needs noise, and
-    normalises by ``probes`` random maps (default: as many as the number of bins needs).
+    normalises by ``probes`` random maps (default: as many as the real numbers of all bins need).
     """
 
     L_max: Annotated[int, Field(ge=0)] = 2

@@ -162,7 +162,7 @@ class DiagnosisSettings:
     large_scales
         Highest degree of signals fixed to the sky that are compared between channels.
     scan_L_max, scan_bins
-        Highest L of the bipolar scan; its bins in l.
+        Highest L of the bipolar scan, which ends at ``biposh.L_max`` too; its bins in l.
     missing_share
         Largest share of the pixels hit by the fiducial scan that observed maps may lack.
     rms_ratio, cl_ratio, biposh_ratio

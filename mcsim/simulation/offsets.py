@@ -3,9 +3,9 @@ r"""What the spread of samples over a pixel does to its value, beyond the pixel 
 A sky S(n) = sum_lm a_lm Y_lm(n) has at the distance r from a pixel's centre n, at the angle chi from e_theta (south)
 towards e_phi (east),
 
-    S(r, chi) = sum_lm P_l(cos r) a_lm Y_lm(n) + 2 Re sum_{s > 0} e^{-i s chi} sum_lm d^l_{0s}(r) a_lm sY_lm(n).
+    S(r, chi) = sum_lm P_l(cos r) a_lm Y_lm(n) + 2 Re sum_{s > 0} e^{-i s chi} sum_lm d^l_{s0}(r) a_lm sY_lm(n).
 
-With rho = sin r, d^l_{0s}(r) is replaced by the sum of h_{l,sn} rho^n, n = s, s + 2, ... up to the order, that comes
+With rho = sin r, d^l_{s0}(r) is replaced by the sum of h_{l,sn} rho^n, n = s, s + 2, ... up to the order, that comes
 closest for samples anywhere in a pixel. The mean over samples then needs the moments <rho^n e^{i s chi}> alone, and one
 transform for each s and n. Powers at s = 0 are taken about their mean over pixels, so that h_{l,00} is the mean of
 P_l(cos r), which stands in place of the pixel window.

@@ -72,8 +72,8 @@ def parallel_transport_harmonics(smax: int, L_max: int, psi0: float = 0.0) -> ND
     Notes
     -----
     A constant w_s is singular at the poles as a spin field, so the coefficients fall only as L^{-3/2}. Each is an
-    integral that a finite rule gives exactly: Gauss-Legendre for even s, where d^L_{0s} is a polynomial in cos(theta),
-    and equal steps in theta for odd s, where d^L_{0s} sin(theta) is a cosine series. The power of w_2 at L = 2, 4, 6,
+    integral that a finite rule gives exactly: Gauss-Legendre for even s, where d^L_{s0} is a polynomial in cos(theta),
+    and equal steps in theta for odd s, where d^L_{s0} sin(theta) is a cosine series. The power of w_2 at L = 2, 4, 6,
     8 is 83.3, 10, 3.1, 1.35 %.
     """
     check_whole(smax, "smax")
@@ -99,11 +99,11 @@ def _isotropic_zero(smax: int, L_max: int) -> NDArray[np.complex128]:
 
 
 def spin_functions(smax: int, L_max: int, theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (-s)Y_L0(theta) = sqrt((2L+1)/4pi) d^L_{0s}(theta) for s = 0..smax, shape (smax + 1, L_max + 1, ntheta).
+    """Return (-s)Y_L0(theta) = sqrt((2L+1)/4pi) d^L_{s0}(theta) for s = 0..smax, shape (smax + 1, L_max + 1, ntheta).
 
     Notes
     -----
-    d^s_{0s} = (-1)^s sqrt((2s)!)/(2^s s!) sin^s(theta), then upwards in L, which is the stable direction.
+    d^s_{s0} = (-1)^s sqrt((2s)!)/(2^s s!) sin^s(theta), then upwards in L, which is the stable direction.
     """
     x = np.cos(theta)
     result = np.zeros((smax + 1, L_max + 1, len(theta)))
