@@ -19,6 +19,8 @@ from mcsim.systematics import Effect, Parametrization, basis_of
 
 BEYOND = 3.0  #: standard deviations by which fits may be beyond the bounds of parameters: at a bound, half of them are
 
+Part = tuple[int, Vector, Matrix]  #: member of a fit, its amplitudes and their covariance
+
 FAINT_LEVEL = 1e-4
 """p-value of noise alone below which elements are not cut that are faint one by one: a library has 100 columns."""
 
@@ -205,9 +207,7 @@ def columns_of(candidates: Sequence[Candidate], members: Sequence[int]) -> list[
     return [column for member in members for column in candidates[member].columns]
 
 
-def parts_of(
-    candidates: Sequence[Candidate], members: Sequence[int], found: Fit
-) -> Iterator[tuple[int, Vector, Matrix]]:
+def parts_of(candidates: Sequence[Candidate], members: Sequence[int], found: Fit) -> Iterator[Part]:
     """Yield each member of a fit of :func:`columns_of`, its amplitudes and their covariance."""
     start = 0
     for member in members:

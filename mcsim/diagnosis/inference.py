@@ -38,7 +38,7 @@ EXPLAINED = 0.5  #: share of the excess chi^2 that a single effect explains whic
 def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     """Diagnose observed maps or measured spectra; raise InputError if they cannot be what they claim to be."""
     context = data.context
-    if _is_out_of_order(data, first := Refiner(data).unrefined(context.templates)):
+    if _is_out_of_order(data, first := Refiner(data).unrefined()):
         first = replace(first, attribution=first.attribution.unexplained())
         return replace(result_of(data, case, first, None, data.notes()), orders=tuple(data.exchanged))
     t = data.templates()

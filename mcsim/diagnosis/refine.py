@@ -7,7 +7,7 @@ import numpy as np
 from scipy import special
 
 from mcsim.datavector.bent import beyond
-from mcsim.datavector.candidate import Candidate, columns_of, parts_of, scatters_of
+from mcsim.datavector.candidate import Candidate, Part, columns_of, parts_of, scatters_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.partial import PartialExplanation, PartialSearch, has_settled
 from mcsim.diagnosis.selection import Attribution, Explanation, Selection, attributed
@@ -77,10 +77,10 @@ class Refiner:
         """Return the model, its simulations and templates."""
         return self.data.context
 
-    def unrefined(self, t: Matrix) -> Refined:
-        """Return the attribution by templates, shape (p, K), without any simulation."""
-        candidates = self.context.candidates
-        return Refined(self._attribute(t, candidates), t, candidates, t)
+    def unrefined(self) -> Refined:
+        """Return the attribution by the templates of the model, without any simulation."""
+        t, candidates = self.context.templates, self.context.candidates
+        return Refined(self._attribute(_Responses(t, t, [*candidates])), t, candidates, t)
 
     def run(
         self,
@@ -107,23 +107,24 @@ class Refiner:
         """
         start = t if start is None else start
         now = _Responses(t, start.copy(), list(candidates))
-        first = found = self._attribute(now.t, now.candidates)
+        first = found = self._attribute(now)
         for _ in range(self.context.settings.refine_rounds):
-            tried = [self._simulate(now, *part, curved=True) for part in self._of_sets(now, sets)]
+            fitted = (part for members in sets for part in self._fitted(now, members)[1])
+            tried = [self._simulate(now, *part, curved=True) for part in fitted]
             changed = tried + [self._simulate(now, *part) for part in self._to_try(found, now.candidates)]
             if not any(changed):
                 break
-            found = self._attribute(now.t, now.candidates)
+            found = self._attribute(now)
         now, found = self._with_smaller(now, self._completed(now, found))
         for index in self._displaced(now, first, found):
             alone = self._alone(now, start, index)
-            own = self._completed(alone, self._attribute(alone.t, alone.candidates))
+            own = self._completed(alone, self._attribute(alone))
             if (index,) in [one.members for one in own.explanations]:
                 now, found = alone, own
         scattered = [i for i, one in enumerate(now.candidates) if one.scatter is not None]
         for index in scattered if all(len(one.members) > 1 for one in found.explanations) else []:
             alone = self._alone(now, start, index)
-            own = self._attribute(alone.t, alone.candidates)
+            own = self._attribute(alone)
             if (index,) in [one.members for one in own.explanations]:
                 now, found = alone, own
                 break
@@ -131,7 +132,7 @@ class Refiner:
         if detected is not None and len(detected.members) <= self.context.settings.max_effects:
             done = {member: now.done.get(member) for member in detected.members}
             beside = _Responses(now.linear, detected.templates.copy(), [*now.candidates], done)
-            together = self._completed(beside, self._attribute(beside.t, beside.candidates))
+            together = self._completed(beside, self._attribute(beside))
             if together.explanations:
                 now, found, detected = beside, together, None
         if found.gap.pvalue > self.context.settings.faint_pvalue:
@@ -139,13 +140,12 @@ class Refiner:
             found = replace(found, probability=min(found.probability, first.probability))
         return Refined(found, now.t, tuple(now.candidates), t, detected)
 
-    def _of_sets(self, now: "_Responses", sets: Sequence[tuple[int, ...]]) -> Iterator[tuple[int, Vector, Matrix]]:
-        """Yield the members of sets with their fitted coordinates."""
-        for members in sets:
-            fit = self.context.null.fit(self.data.x, now.t[:, columns_of(now.candidates, members)])
-            yield from parts_of(now.candidates, members, fit)
+    def _fitted(self, now: _Responses, members: Sequence[int]) -> tuple[Fit, list[Part]]:
+        """Return the fit of a set, and its members with their coordinates."""
+        fit = self.context.null.fit(self.data.x, now.t[:, columns_of(now.candidates, members)])
+        return fit, list(parts_of(now.candidates, members, fit))
 
-    def _completed(self, now: "_Responses", found: Attribution) -> Attribution:
+    def _completed(self, now: _Responses, found: Attribution) -> Attribution:
         """Return the attribution once each member of its best sets has been simulated, at the fitted amplitude."""
         while best := found.explanations[:2]:
             parts = [part for one in best for part in parts_of(now.candidates, one.members, one.fit)]
@@ -154,10 +154,10 @@ class Refiner:
             changed += [self._simulate_in_place(now, *place) for one in best for place in self._alike(now, one)]
             if not any(changed):
                 break
-            found = self._attribute(now.t, now.candidates)
+            found = self._attribute(now)
         return found
 
-    def _with_smaller(self, now: "_Responses", found: Attribution) -> tuple["_Responses", Attribution]:
+    def _with_smaller(self, now: _Responses, found: Attribution) -> tuple[_Responses, Attribution]:
         """Return responses and attribution with a smaller set, if one suffices once it is simulated at its amplitudes.
 
         Single candidates are simulated at theirs beforehand. What a bent response leaves of the data seems to be more
@@ -168,20 +168,20 @@ class Refiner:
             beside = now.copy()
             for index in members:
                 self._simulate_in_place(beside, tuple(one for one in members if one != index), index)
-            together = self._completed(beside, self._attribute(beside.t, beside.candidates))
+            together = self._completed(beside, self._attribute(beside))
             if 0 < _size(together) < size:
                 return beside, together
         return now, found
 
-    def _nearly(self, now: "_Responses", size: int) -> Iterator[tuple[int, ...]]:
+    def _nearly(self, now: _Responses, size: int) -> Iterator[tuple[int, ...]]:
         """Yield sets of several members, fewer than a size, that explain nearly as much as the best of as many."""
-        chosen = self._selection(now.t, now.candidates)
+        chosen = self._selection(now)
         for fewer in range(2, size):
             ranked = chosen.most_probable(fewer, 2 * self.context.settings.tried)
             most = max((fit.delta_chi2 for _, fit in ranked), default=0.0)
             yield from (members for members, fit in ranked if fit.delta_chi2 >= NEARLY * most)
 
-    def _alike(self, now: "_Responses", one: Explanation) -> list[tuple[tuple[int, ...], int]]:
+    def _alike(self, now: _Responses, one: Explanation) -> list[tuple[tuple[int, ...], int]]:
         """Return candidates that were not simulated and are like a member of a set, behind the other members.
 
         All of them if the residual does not pass without an error of the templates: far from linear responses what is
@@ -205,15 +205,14 @@ class Refiner:
                     found.setdefault(index, others)
         return [(others, index) for index, others in found.items()]
 
-    def _may_replace(self, now: "_Responses", one: Explanation, others: tuple[int, ...], index: int) -> bool:
+    def _may_replace(self, now: _Responses, one: Explanation, others: tuple[int, ...], index: int) -> bool:
         """Return True if an effect fits worse than a set beside others by no more than its bent response may cost it.
 
         A template that is wrong by b standard deviations raises chi^2 of the true effect by b^2 on average, with a
         scatter of 2 b. By how much the products of a dipole with the observed sky are wrong is not known.
         """
-        together, candidate, settings = (*others, index), now.candidates[index], self.context.settings
-        fit = self.context.null.fit(self.data.x, now.t[:, columns_of(now.candidates, together)])
-        *_, (_, coordinates, covariance) = parts_of(now.candidates, together, fit)
+        candidate, settings = now.candidates[index], self.context.settings
+        fit, (*_, (_, coordinates, covariance)) = self._fitted(now, (*others, index))
         with if_possible():  # of no such size
             there = candidate.table(candidate.detected(coordinates, covariance))
             if self.data.dipole_snr([there]) > settings.nonlinear_sigma:
@@ -222,20 +221,18 @@ class Refiner:
         allowed = (bend + 2.0) ** 2 + 2.0 * np.log(settings.odds_cut)
         return bend > settings.nonlinear_sigma and fit.chi2 - one.fit.chi2 <= allowed
 
-    def _simulate_in_place(self, now: "_Responses", others: tuple[int, ...], index: int) -> bool:
+    def _simulate_in_place(self, now: _Responses, others: tuple[int, ...], index: int) -> bool:
         """Simulate a candidate beside others at its amplitude until that settles; return True if anything changed."""
         changed = False
         for _ in range(self.context.settings.refine_rounds):
-            together = (*others, index)
-            fit = self.context.null.fit(self.data.x, now.t[:, columns_of(now.candidates, together)])
-            *_, part = parts_of(now.candidates, together, fit)
+            _, (*_, part) = self._fitted(now, (*others, index))
             if not self._simulate(now, *part, curved=True):
                 break
             changed = True
         return changed
 
     def _simulate(
-        self, now: "_Responses", index: int, coordinates: Vector, covariance: Matrix, curved: bool = False
+        self, now: _Responses, index: int, coordinates: Vector, covariance: Matrix, curved: bool = False
     ) -> bool:
         """Simulate a candidate at fitted coordinates, and return True, unless it has been there.
 
@@ -279,7 +276,7 @@ class Refiner:
                 now.candidates[index] = replace(candidate, acting=None, scatter=self.data.scatter(drawn))
         return True
 
-    def _has_been(self, now: "_Responses", index: int, coordinates: Vector, covariance: Matrix) -> bool:
+    def _has_been(self, now: _Responses, index: int, coordinates: Vector, covariance: Matrix) -> bool:
         """Return True if a candidate was simulated about at these coordinates, or at the possible ones next to them."""
         candidate, settings = now.candidates[index], self.context.settings
         if has_settled(settings, now.asked.get(index), coordinates, covariance):
@@ -290,7 +287,7 @@ class Refiner:
             return False
         return has_settled(settings, now.done.get(index), at, covariance)
 
-    def _displaced(self, now: "_Responses", first: Attribution, found: Attribution) -> list[int]:
+    def _displaced(self, now: _Responses, first: Attribution, found: Attribution) -> list[int]:
         """Return candidates that explain less alone than by their first templates, and were simulated elsewhere.
 
         In a set the amplitudes of effects that are alike can be large and of opposite signs. A response that was
@@ -304,7 +301,7 @@ class Refiner:
             and not has_settled(self.context.settings, done, alone.amplitudes, alone.covariance)
         ]
 
-    def _alone(self, now: "_Responses", start: Matrix, index: int) -> "_Responses":
+    def _alone(self, now: _Responses, start: Matrix, index: int) -> _Responses:
         """Return the responses with a candidate at the amplitude that it has alone, by its first templates at first."""
         null, columns = self.context.null, list(now.candidates[index].columns)
         now = now.copy()
@@ -319,12 +316,12 @@ class Refiner:
                 break
         return now
 
-    def _attribute(self, t: Matrix, candidates: Sequence[Candidate]) -> Attribution:
-        return attributed(self._selection(t, candidates), self.data.gap)
+    def _attribute(self, now: _Responses) -> Attribution:
+        return attributed(self._selection(now), self.data.gap)
 
-    def _selection(self, t: Matrix, candidates: Sequence[Candidate]) -> Selection:
+    def _selection(self, now: _Responses) -> Selection:
         known = self.context
-        return Selection(known.null, self.data.x, t, candidates, known.calibration, known.settings)
+        return Selection(known.null, self.data.x, now.t, now.candidates, known.calibration, known.settings)
 
     def _squared(self, linear: Matrix, t: Matrix, at: Vector) -> float:
         """Return the share of the response of templates at coordinates that is not in the linear ones, 0 to 1."""
@@ -350,17 +347,15 @@ class Refiner:
                 return candidate.parametrization.coordinates(effect), changes, pair
         return None
 
-    def _to_try(self, found: Attribution, candidates: Sequence[Candidate]) -> list[tuple[int, Vector, Matrix]]:
+    def _to_try(self, found: Attribution, candidates: Sequence[Candidate]) -> list[Part]:
         """Return candidates with fitted coordinates: those of the best explanations, or the best single ones."""
-        work: dict[int, tuple[int, Vector, Matrix]] = {}
         if found.verdict == "none":
             return []
-        for explanation in found.explanations[:2]:
-            for part in parts_of(candidates, explanation.members, explanation.fit):
-                work.setdefault(part[0], part)
-        for index, single in enumerate(found.singles):
-            if candidates[index].nuisance:
-                work.setdefault(index, (index, single.amplitudes, single.covariance))
+        singles: list[Part] = [(index, one.amplitudes, one.covariance) for index, one in enumerate(found.singles)]
+        sets = [part for one in found.explanations[:2] for part in parts_of(candidates, one.members, one.fit)]
+        work: dict[int, Part] = {}
+        for part in sets + [part for part in singles if candidates[part[0]].nuisance]:
+            work.setdefault(part[0], part)
         # Single ones too: a strong effect has a nonlinear response, and a stochastic one scatters it, until only a
         # mixture seems to be sufficient. Where a single one is, the stochastic ones that may be as well.
         alone = bool(found.explanations) and len(found.explanations[0].members) == 1
@@ -368,8 +363,7 @@ class Refiner:
         explained = np.array([single.delta_chi2 for single in found.singles])
         ranked = [int(index) for index in np.argsort(-explained)]
         # Squares of maps, which a strong effect makes, are fitted best by responses that no effect can have so large.
-        fits = [(single.amplitudes, single.covariance) for single in found.singles]
-        inside = [one for one in ranked if candidates[one].beyond(*fits[one]) == 0.0]
+        inside = [index for index in ranked if candidates[index].beyond(*singles[index][1:]) == 0.0]
         best = {one for among in (ranked, inside) for one in _nearly_best(explained, among, tried)}
         stochastic = {candidates[index].identity for index in work if candidates[index].parametrization.stochastic}
         for index in ranked:
@@ -380,7 +374,7 @@ class Refiner:
             )
             detected = detected and (not alone or self._may_suffice(candidate, single))
             if index in best or (detected and candidate.identity not in stochastic):
-                work.setdefault(index, (index, single.amplitudes, single.covariance))
+                work.setdefault(index, singles[index])
                 if candidate.parametrization.stochastic:
                     stochastic.add(candidate.identity)
         return list(work.values())

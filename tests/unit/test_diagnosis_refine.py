@@ -379,8 +379,8 @@ def test_a_stochastic_effect_is_tried_at_the_amplitude_that_it_has_alone(monkeyp
     (one,) = pair.explanations
     set_fit = instrument.null.fit(x - 12.0 * instrument.t[:, 0], instrument.t[:, :2])
 
-    def attributed(self, t, candidates):
-        scatter = candidates[0].scatter
+    def attributed(self, now):
+        scatter = now.candidates[0].scatter
         if scatter is not None and np.sqrt(np.sum(scatter**2)) > enough:
             return pair
         return replace(pair, explanations=(replace(one, members=(0, 1), fit=set_fit),), verdict="mixture")
@@ -398,11 +398,11 @@ def test_what_was_simulated_far_away_in_a_set_is_tried_at_the_amplitude_that_it_
     instrument.t[:, 2] = x / np.linalg.norm(x)
     far = instrument.null.fit(x + 45.0 * instrument.t[:, 0], instrument.t[:, :2])
 
-    def attributed(self, t, candidates):
-        found = attribute(instrument.null, x, t, candidates, instrument.calibration)
+    def attributed(self, now):
+        found = attribute(instrument.null, x, now.t, now.candidates, instrument.calibration)
         (best, *_) = found.explanations
         in_a_set = replace(found, explanations=(replace(best, members=(0, 1), fit=far),), verdict="mixture")
-        return in_a_set if np.array_equal(t, instrument.t) else found
+        return in_a_set if np.array_equal(now.t, instrument.t) else found
 
     monkeypatch.setattr(Refiner, "_attribute", attributed)
     found = instrument.refined(x).attribution
