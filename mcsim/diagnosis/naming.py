@@ -34,22 +34,20 @@ def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[
     doubted: list[tuple[Explanation, str]] = []
     sentences: list[str] = []
     for one in found.explanations:
-        members, why = [candidates[member] for member in one.members], ""
-        if any(is_drawn(candidate) for candidate in members):
+        members = [candidates[member] for member in one.members]
+        if any(map(is_drawn, members)):
             if len(frequencies) == 1:
+                refused.append(one)
                 why = "at a single frequency it looks like any signal that is fixed to the sky"
+                sentences.append(f"The data vector fits {_title(candidates, one)}, which is not named: {why}.")
+                continue
         elif len(kept) < settings.compared_sets:
             one = replace(one, findings=slices.findings(members, list(_actions(data, refined, one))))
             if one.findings.contradict(settings):
                 effects = [candidates[k].fitted(*part) for k, *part in parts_of(candidates, one.members, one.fit)]
-                doubt = contradiction(one.findings, members, effects, settings.consistency_level)
-                doubted.append((one, doubt))
+                doubted.append((one, contradiction(one.findings, members, effects, settings.consistency_level)))
                 continue
-        if why:
-            refused.append(one)
-            sentences.append(f"The data vector fits {_title(candidates, one)}, which is not named: {why}.")
-        else:
-            kept.append(one)
+        kept.append(one)
     agreed = tuple(kept)
     whole = sum(one.odds for one in found.explanations)
     for one, doubt in doubted:

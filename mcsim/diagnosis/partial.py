@@ -65,11 +65,11 @@ class PartialSearch:
                 refused.add(best)
         if not members:
             return None
-        fit = null.fit(self.data.x, t[:, columns_of(candidates, members)])
+        own = t[:, columns_of(candidates, members)]
+        fit = null.fit(self.data.x, own)
         excess = null.hartlap_factor * null.chi2(self.data.x) - null.dimension
         left = null.hartlap_factor * fit.chi2 - fit.dimension
         if scatters := scatters_of(candidates, members):
-            own = t[:, columns_of(candidates, members)]
             wide = null.with_extra_covariance(*scatters).fit(self.data.x, own)
             fit = with_drawn_scatter(null, own, wide, scatters)
         return PartialExplanation(members, fit, min(max(left / excess, 0.0), 1.0) if excess > 0.0 else 1.0, t)
