@@ -6,7 +6,7 @@ import numpy as np
 
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.diagnosis.selection import Attribution, attribute
+from mcsim.diagnosis.selection import Attribution, Selection, attribute
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.systematics import Effect, Parametrization
@@ -33,7 +33,7 @@ class Bench:
     def diagnose_maps(self, signal: np.ndarray, seed: int, **options) -> Attribution:
         x = signal + np.random.default_rng(seed).normal(size=P)
         settings = replace(DiagnosisSettings(), **options)
-        return attribute(self.null, x, self.t, self.candidates, self.calibration, settings)
+        return attribute(Selection(self.null, x, self.t, self.candidates, self.calibration, settings))
 
 
 def directions(count: int, seed: int) -> np.ndarray:

@@ -19,7 +19,7 @@ from mcsim.datavector.campaign import Batch, asking
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.context import DiagnosisContext
-from mcsim.diagnosis.selection import Attribution, Verdict, attribute
+from mcsim.diagnosis.selection import Attribution, Selection, Verdict, attribute
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError
 from mcsim.sphere import rng
@@ -239,7 +239,7 @@ def judge(model: LinearModel, prior: Prior, seed: int, cases: Sequence[Draw]) ->
     found = []
     for draw in cases:
         x = model.data[draw.number % len(model.data)] + draw.response
-        said = attribute(model.null, x, model.templates, model.candidates, model.calibration)
+        said = attribute(Selection(model.null, x, model.templates, model.candidates, model.calibration))
         said = said.if_named(DiagnosisSettings())
         reduction = model.held_out_reduction(x, said.explanations[0].members) if said.explanations else None
         record = Record(

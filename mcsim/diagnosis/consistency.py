@@ -100,9 +100,6 @@ class Findings:
         return bool(self.comparisons) and all(any(len(one.slices) > 1 for one in own) for own in self.comparisons)
 
 
-NOT_TESTED = Findings()
-
-
 @dataclass(frozen=True)
 class Action:
     """Describe what a fitted effect does to the data and the numbers beside them, p + E together.

@@ -10,7 +10,7 @@ from mcsim.datavector.bent import beyond
 from mcsim.datavector.candidate import Candidate, Part, columns_of, parts_of, scatters_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.partial import PartialExplanation, PartialSearch, has_settled
-from mcsim.diagnosis.selection import Attribution, Explanation, Selection, attributed
+from mcsim.diagnosis.selection import Attribution, Explanation, Selection, attribute
 from mcsim.errors import InputError
 from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit
@@ -317,7 +317,7 @@ class Refiner:
         return now
 
     def _attribute(self, now: _Responses) -> Attribution:
-        return attributed(self._selection(now), self.data.gap)
+        return attribute(self._selection(now), self.data.gap)
 
     def _selection(self, now: _Responses) -> Selection:
         known = self.context

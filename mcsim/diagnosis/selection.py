@@ -11,7 +11,7 @@ from scipy import special
 
 from mcsim.datavector.candidate import Candidate, beyond, columns_of
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.diagnosis.consistency import NOT_TESTED, Findings
+from mcsim.diagnosis.consistency import Findings
 from mcsim.diagnosis.subsets import EXHAUSTIVE, Subsets, chunks
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
@@ -38,7 +38,7 @@ class Explanation:
     odds: float
     pvalue: float
     further: float
-    findings: Findings = NOT_TESTED
+    findings: Findings = field(default_factory=Findings)
 
 
 @dataclass(frozen=True)
@@ -105,18 +105,11 @@ class Attribution:
         return replace(self, verdict="unknown", explanations=(), contrasts=())
 
 
-def attribute(
-    null: SimulatedGaussian,
-    x: Vector,
-    t: Matrix,
-    candidates: Sequence[Candidate],
-    calibration: Calibration,
-    settings: DiagnosisSettings | None = None,
-) -> Attribution:
-    """Attribute a departure of data, shape (p_raw,), from the model to the smallest sets of candidates that explain it.
+def attribute(selection: "Selection", gap: GlobalTest | None = None) -> Attribution:
+    """Attribute a departure of data from the model to the smallest sets of candidates that explain it.
 
-    ``null`` is the distribution of the data vector without an effect; ``t`` are templates per unit amplitude, shape
-    (p_raw, K); ``calibration`` is :func:`~mcsim.stats.look_elsewhere.calibrate` of the candidates in this order.
+    ``gap``: the test of the data against the model, with templates that do not follow from the data: what is measured
+    anew once they were looked at would be another chance. None: the test with the templates of the selection.
 
     Notes
     -----
@@ -130,15 +123,6 @@ def attribute(
     template that is wrong by a fraction eps of its white norm leaves eps^2 s_c^2 in the residual, s_c the white norm of
     its fitted part (at most that of the whole fit); the sum over members makes both tests noncentral, in the least
     favourable direction. The prior of a set is k! times the product of its candidates' shares of the weight.
-    """
-    return attributed(Selection(null, x, t, candidates, calibration, settings or DiagnosisSettings()))
-
-
-def attributed(selection: "Selection", gap: GlobalTest | None = None) -> Attribution:
-    """Return :func:`attribute` of the fields of a selection.
-
-    ``gap``: the test of the data against the model, with templates that do not follow from the data: what is measured
-    anew once they were looked at would be another chance. None: the test with the templates of the selection.
     """
     null, candidates, settings = selection.null, selection.candidates, selection.settings
     first = selection.searches[0]
@@ -183,14 +167,14 @@ class _Accepted:
 
 @dataclass(frozen=True)
 class Selection:
-    """Select among sets of candidates; fields are the arguments of :func:`attribute`."""
+    """Select among sets of candidates."""
 
-    null: SimulatedGaussian
-    x: Vector
-    t: Matrix
+    null: SimulatedGaussian  # distribution of the data vector without an effect
+    x: Vector  # data, (p_raw,)
+    t: Matrix  # templates per unit amplitude, (p_raw, K)
     candidates: Sequence[Candidate]
-    calibration: Calibration
-    settings: DiagnosisSettings
+    calibration: Calibration  # :func:`~mcsim.stats.look_elsewhere.calibrate` of the candidates in this order
+    settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
     _fits: dict[tuple[Subsets, tuple[int, ...]], Fit] = field(default_factory=dict, init=False)
 
     def explanations(self, accepted: Sequence[_Accepted]) -> Iterator[Explanation]:

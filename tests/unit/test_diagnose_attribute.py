@@ -15,7 +15,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import words
 from mcsim.diagnosis.inference import confirmed
 from mcsim.diagnosis.partial import PartialExplanation, PartialSearch
-from mcsim.diagnosis.selection import Attribution, Contrast, attribute
+from mcsim.diagnosis.selection import Attribution, Contrast, Selection, attribute
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.stats.excess import HeldOut, Measured
 from mcsim.stats.scattered import Acting
@@ -146,7 +146,7 @@ def test_the_probability_of_a_name_is_the_rate_at_which_it_is_right():
         member = int(draw.integers(-4, 4))
         size = draw.normal(scale=draw.choice(settings.prior_snr)) if member >= 0 else 0.0
         x = draw.normal(size=P) + (size * bench.t[:, member] if member >= 0 else 0.0)
-        found = attribute(bench.null, x, bench.t, bench.candidates, bench.calibration, settings)
+        found = attribute(Selection(bench.null, x, bench.t, bench.candidates, bench.calibration, settings))
         if found.explanations:
             said.append(found.probability)
             right.append(any(one.members == (member,) for one in found.explanations))

@@ -25,7 +25,8 @@ def test_an_effect_that_scatters_the_data_is_probable_although_it_leaves_much(be
     named = 0
     for seed in range(20):
         x = 30.0 * bench.t[:, 0] + 2.5 * np.random.default_rng(seed).normal(size=P)
-        found = attribute(bench.null, x, bench.t, candidates, bench.calibration).if_named(DiagnosisSettings())
+        found = attribute(Selection(bench.null, x, bench.t, candidates, bench.calibration))
+        found = found.if_named(DiagnosisSettings())
         named += found.verdict == "effect" and found.explanations[0].members == (0,)
     # 94 % by the levels of both tests, less three sigma.
     assert named >= 16

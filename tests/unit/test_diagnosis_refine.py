@@ -10,7 +10,7 @@ from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.partial import PartialSearch
 from mcsim.diagnosis.refine import Refiner, _nearly_best
-from mcsim.diagnosis.selection import attribute
+from mcsim.diagnosis.selection import Selection, attribute
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate, global_test
@@ -99,7 +99,7 @@ class Instrument:
 def test_a_bent_response_is_found_at_its_amplitude(amplitude):
     instrument = Instrument(bend=0.04, cross=0.0)
     x = instrument.response(amplitude, 0.0)
-    plain = attribute(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration)
+    plain = attribute(Selection(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration))
     assert plain.verdict == "unknown"
     found = instrument.refined(x).attribution
     assert [explanation.members for explanation in found.explanations] == [(0,)]
@@ -186,7 +186,7 @@ def test_what_is_like_a_member_is_simulated_where_a_set_suffices_by_tolerance_al
     x = instrument.response(1000.0, 0.0)
     along = x / np.linalg.norm(x)
     instrument.t[:, 2] = along + 0.009 * instrument.sideways[1]
-    plain = attribute(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration)
+    plain = attribute(Selection(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration))
     assert [one.members for one in plain.explanations] == [(2,)]
     assert plain.explanations[0].fit.pvalue < 1e-3 < 0.02 < plain.explanations[0].pvalue
     found = instrument.refined(x).attribution
@@ -211,7 +211,7 @@ def test_the_bent_response_of_one_of_two_is_not_explained_by_two_in_its_place():
     groups = instrument.null.whiten_groups(instrument.t, [(0,), (1,), (2,), (3,)])
     instrument.calibration, instrument.curvature = calibrate(instrument.null, groups), np.zeros((P, 4))
     instrument.settings = DiagnosisSettings(tried=1)
-    plain = attribute(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration)
+    plain = attribute(Selection(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration))
     assert [one.members for one in plain.explanations] == [(1, 2, 3)]
     best, *_ = instrument.refined(x).attribution.explanations
     assert best.members == (0, 1)
@@ -240,7 +240,7 @@ def test_a_faint_gap_has_the_odds_of_templates_that_were_known_before(along, fai
     """The bend explains 3 more of the noise, which is no evidence for what was simulated at the amplitude of noise."""
     instrument = Instrument(bend=3.0 / along**2, cross=0.0)
     x = instrument.response(along, 0.0)
-    plain = attribute(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration)
+    plain = attribute(Selection(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration))
     found = instrument.refined(x).attribution
     assert (found.gap.pvalue > instrument.settings.faint_pvalue) == faint
     assert found.verdict == "effect"
@@ -253,7 +253,7 @@ def test_a_faint_gap_has_the_odds_of_templates_that_were_known_before(along, fai
 def test_effects_that_change_each_other_are_simulated_together():
     instrument = Instrument(bend=0.0, cross=0.06)
     x = instrument.response(12.0, 14.0)
-    plain = attribute(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration)
+    plain = attribute(Selection(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration))
     assert plain.verdict == "unknown"
     found = instrument.refined(x).attribution
     assert instrument.analysis[-1].keys() == {"A", "B"}
@@ -375,7 +375,7 @@ def test_a_stochastic_effect_is_tried_at_the_amplitude_that_it_has_alone(monkeyp
         return float(table.parameters["amplitude"]) * (instrument.t[:, 0] + patterns[:skies])
 
     x = 14.0 * instrument.t[:, 0]
-    pair = attribute(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration)
+    pair = attribute(Selection(instrument.null, x, instrument.t, instrument.candidates, instrument.calibration))
     (one,) = pair.explanations
     set_fit = instrument.null.fit(x - 12.0 * instrument.t[:, 0], instrument.t[:, :2])
 
@@ -399,7 +399,7 @@ def test_what_was_simulated_far_away_in_a_set_is_tried_at_the_amplitude_that_it_
     far = instrument.null.fit(x + 45.0 * instrument.t[:, 0], instrument.t[:, :2])
 
     def attributed(self, now):
-        found = attribute(instrument.null, x, now.t, now.candidates, instrument.calibration)
+        found = attribute(Selection(instrument.null, x, now.t, now.candidates, instrument.calibration))
         (best, *_) = found.explanations
         in_a_set = replace(found, explanations=(replace(best, members=(0, 1), fit=far),), verdict="mixture")
         return in_a_set if np.array_equal(now.t, instrument.t) else found

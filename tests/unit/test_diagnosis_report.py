@@ -25,7 +25,7 @@ from mcsim.diagnosis import report, words
 from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import DiagnosisResult
-from mcsim.diagnosis.selection import attribute
+from mcsim.diagnosis.selection import Selection, attribute
 from mcsim.reconstruction.result import HEAD
 from mcsim.stats.detection import confusion, snr_needed
 from mcsim.stats.excess import HeldOut, Measured
@@ -127,7 +127,7 @@ def diagnosis(kind: str) -> DiagnosisResult:
     if kind == "unknown":
         strange = rng.normal(size=P)
         x += 15.0 * (strange - t @ np.linalg.lstsq(t, strange, rcond=None)[0]) / np.sqrt(P)
-    found = attribute(context.null, x, t, context.candidates, context.calibration)
+    found = attribute(Selection(context.null, x, t, context.candidates, context.calibration))
     where = [Place(context.analysis.elements[0], 9.1, 1e-8), Place(context.analysis.elements[-2], 1.0, 0.7)]
     reduction = None
     if found.explanations:

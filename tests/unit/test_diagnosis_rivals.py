@@ -10,7 +10,7 @@ from mcsim.datavector.candidate import Candidate, TemplateBank, numbered
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.rivals import _in_other_splits, in_place
-from mcsim.diagnosis.selection import attribute
+from mcsim.diagnosis.selection import Selection, attribute
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
 from mcsim.systematics import Effect, Parametrization
@@ -32,7 +32,7 @@ def named() -> SimpleNamespace:
     candidates = numbered([candidate("a", "V1"), candidate("b", "V1"), candidate("c", None)])
     groups = null.whiten_groups(t[:, :3], [one.columns for one in candidates])
     x = S * t[:, 1] + rng.normal(size=P)
-    found = attribute(null, x, t[:, :3], candidates, calibrate(null, groups, draws=2000))
+    found = attribute(Selection(null, x, t[:, :3], candidates, calibrate(null, groups, draws=2000)))
     assert [one.members for one in found.explanations] == [(1,)]
     return SimpleNamespace(null=null, x=x, t=t, refined=Refined(found, t[:, :3], candidates, t[:, :3]))
 
@@ -107,5 +107,5 @@ def test_all_splits_that_explain_the_data_are_given(named, key, both):
     near = 0.999 * named.t[:, [1]] + np.sqrt(1.0 - 0.999**2) * named.t[:, [4]]
     t = np.concatenate([named.t[:, :2], -near], axis=1)
     groups = named.null.whiten_groups(t, [each.columns for each in candidates])
-    found = attribute(named.null, named.x, t, candidates, calibrate(named.null, groups, draws=2000))
+    found = attribute(Selection(named.null, named.x, t, candidates, calibrate(named.null, groups, draws=2000)))
     assert sorted(each.members for each in found.explanations) == ([(1,), (2,)] if both else [(1,)])

@@ -25,7 +25,7 @@ from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
-from mcsim.diagnosis.selection import attribute
+from mcsim.diagnosis.selection import Selection, attribute
 from mcsim.simulation import sampled
 from mcsim.simulation.survey import survey
 from mcsim.stats.intervals import share
@@ -110,7 +110,7 @@ def judge(model: LinearModel, name: str, cases: Sequence[tuple[int, Drawn]]) -> 
     for case, drawn in cases:
         response = model.response(drawn.members)
         x = model.data[case % len(model.data)] + response
-        said = attribute(model.null, x, model.templates, model.candidates, model.calibration)
+        said = attribute(Selection(model.null, x, model.templates, model.candidates, model.calibration))
         said = said.if_named(DiagnosisSettings())
         answers = [frozenset(model.identities[m] for m in one.members) for one in said.explanations]
         other = [identity not in drawn.identities for identity in model.identities]

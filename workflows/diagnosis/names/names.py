@@ -248,7 +248,7 @@ def true(number):
     from mcsim.datavector.candidate import numbered
     from mcsim.diagnosis.refine import Refined
     from mcsim.diagnosis.rivals import in_place, with_candidates
-    from mcsim.diagnosis.selection import attribute
+    from mcsim.diagnosis.selection import Selection, attribute
     from mcsim.stats.detection import cosines
     from mcsim.stats.intervals import share
 
@@ -278,7 +278,7 @@ def true(number):
             (member,) = sampler.members(np.random.default_rng([1, case]), 1)
             z = data[case % len(data)] + whole[:, list(known.candidates[member.candidate].columns)] @ member.coordinates
             x = z[: len(linear.null.mean)]
-            found = attribute(known.null, x, known.templates, known.candidates, known.calibration).if_named(
+            found = attribute(Selection(known.null, x, known.templates, known.candidates, known.calibration)).if_named(
                 known.settings
             )
             row, counted = said(found, known, member.identity), []
@@ -290,7 +290,7 @@ def true(number):
                     places = in_place(null, seen, refined, members, rivals, known.settings)
                     if near := [rivals[index] for index, _ in places]:
                         more = with_candidates(known, near)
-                        named = attribute(more.null, x, more.templates, more.candidates, more.calibration)
+                        named = attribute(Selection(more.null, x, more.templates, more.candidates, more.calibration))
                         counted[-4:] = said(named.if_named(more.settings), more, member.identity)
                 if named is not found and counted[-4:] != row:
                     print(run.name, member.identity, round(member.strength, 1), len(seen), [c.label for c, _ in near])
@@ -434,7 +434,7 @@ def several(number):
     from mcsim.benchmark.case import Prior
     from mcsim.benchmark.models import linear_model
     from mcsim.benchmark.sampler import CaseSampler
-    from mcsim.diagnosis.selection import attribute
+    from mcsim.diagnosis.selection import Selection, attribute
     from mcsim.stats.intervals import share
 
     linear = linear_model(learned(MODEL)[1])
@@ -451,7 +451,7 @@ def several(number):
                 others = rivals | np.isin(np.arange(len(rivals)), [o.candidate for o in members if o is not one])
                 alike = max(alike, float(linear.cosines(response)[others].max()))
             x = linear.data[case % len(linear.data)] + sum(responses)
-            found = attribute(linear.null, x, linear.templates, linear.candidates, linear.calibration)
+            found = attribute(Selection(linear.null, x, linear.templates, linear.candidates, linear.calibration))
             said = found.if_named(settings)
             answers = [{linear.identities[member] for member in one.members} for one in said.explanations]
             wrong = said.verdict in ("effect", "mixture") and not answers[0] <= truth
