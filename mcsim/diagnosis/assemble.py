@@ -11,6 +11,7 @@ from mcsim.datavector.nuisances import NuisanceResult, Regression, with_priors
 from mcsim.diagnosis.consistency import amplitudes
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.fitted import CandidateResult, EffectResult, EffectSet
+from mcsim.diagnosis.partial import PartialExplanation
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Explanation
@@ -46,7 +47,7 @@ def result_of(
         probability=found.probability,
         cosine=found.cosine,
         nearest_pvalue=found.singles[found.nearest].pvalue,
-        partial=() if partial is None else tuple(_partial(context, refined)),
+        partial=() if partial is None else tuple(_partial(context, refined.candidates, partial)),
         partial_left=None if partial is None else partial.left,
         held_out=reduction,
         nuisances=tuple(_nuisances(data, refined)),
@@ -80,15 +81,13 @@ def result_of(
     )
 
 
-def _partial(context: DiagnosisContext, refined: Refined) -> Iterator[EffectResult]:
+def _partial(
+    context: DiagnosisContext, candidates: Sequence[Candidate], found: PartialExplanation
+) -> Iterator[EffectResult]:
     """Return effects that do not explain all, with the priors of nuisances among them in their errors."""
-    assert refined.partial is not None  # the caller has asked
-    found = refined.partial
-    members = [refined.candidates[member] for member in found.members]
-    t = found.templates[:, columns_of(context.candidates, found.members)]
-    return effects_of(
-        context.candidates, found.members, with_priors(context.null, t, found.fit, members), context.frame
-    )
+    t = found.templates[:, columns_of(candidates, found.members)]
+    fit = with_priors(context.null, t, found.fit, [candidates[member] for member in found.members])
+    return effects_of(context.candidates, found.members, fit, context.frame)
 
 
 def _set_of(context: DiagnosisContext, one: Explanation) -> EffectSet:

@@ -225,7 +225,7 @@ class DiagnosisResult:
             **({} if self.unlisted is None else {"unlisted": [one.to_json() for one in self.unlisted]}),
             **({} if self.unlisted_held_out is None else {"unlisted_shrink": self.unlisted_held_out.to_json()}),
             **({"untested": list(self.untested)} if self.untested else {}),
-            **({"nuisances": [_nuisance_json(one) for one in self.nuisances]} if self.nuisances else {}),
+            **({"nuisances": [_plain(one) for one in self.nuisances]} if self.nuisances else {}),
             **({"warnings": list(self.warnings)} if self.warnings else {}),
             **({"worth": self.provenance["worth"]} if "worth" in self.provenance else {}),
             **({"controls": self.controls.to_json()} if self.controls is not None else {}),
@@ -336,12 +336,16 @@ _DERIVED: dict[str, tuple[str | tuple[str, ...], str, str]] = {
 """Dimensions, units and meaning of the variables of a dataset."""
 
 
+_FOR_PEOPLE = ("label", "words", "consistency", "parts")
+
+
+def _plain(found: EffectResult | NuisanceResult) -> dict[str, Any]:
+    """Return all that is not for people to read."""
+    return {name: value for name, value in vars(found).items() if name not in _FOR_PEOPLE}
+
+
 def _effect_json(effect: EffectResult) -> dict[str, Any]:
-    plain = {name: value for name, value in vars(effect).items() if name not in _NOT_IN_JSON}
-    return plain | {"consistency": [_comparison_json(effect, one) for one in effect.consistency]}
-
-
-_NOT_IN_JSON = ("label", "words", "consistency", "parts")
+    return _plain(effect) | {"consistency": [_comparison_json(effect, one) for one in effect.consistency]}
 
 
 def _comparison_json(effect: EffectResult, one: Comparison) -> dict[str, Any]:
@@ -353,10 +357,6 @@ def _comparison_json(effect: EffectResult, one: Comparison) -> dict[str, Any]:
 
 def _set_json(one: EffectSet) -> dict[str, Any]:
     return {"effects": [_effect_json(effect) for effect in one.effects], "maps": [asdict(own) for own in one.maps]}
-
-
-def _nuisance_json(found: NuisanceResult) -> dict[str, Any]:
-    return {f.name: getattr(found, f.name) for f in fields(found) if f.name not in ("label", "words")}
 
 
 def _place_json(place: Place) -> dict[str, Any]:
