@@ -123,9 +123,7 @@ def diagnose(
         drawn = controls.diagnose_controls(known, key, wanted, call, quiet) if wanted else None
         with asking(call, quiet, task, "simulations of fitted effects") as ask:
             known = known.of_pixel_means if means else known
-            found: DataSet[Any] = (
-                ObservedMaps(known, maps, ask) if table is None else MeasuredSpectra(known, table, ask)
-            )
+            found: DataSet = ObservedMaps(known, maps, ask) if table is None else MeasuredSpectra(known, table, ask)
             if source is not None:
                 campaign.check_data(found.x, ensemble, source)
             diagnosis = diagnose_data(found, str(case or run.name))

@@ -1,7 +1,6 @@
 """Test data with the scatter that they have with noise that was found, where it is far from the model's."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,7 @@ few skies tell of the scatter along each response suffices."""
 ROUNDS = 3  #: of finding noise with the scatter of what was found before
 
 
-def with_found_noise(data: DataSet[Any], refined: Refined) -> tuple[DataSet[Any], Refined]:
+def with_found_noise(data: DataSet, refined: Refined) -> tuple[DataSet, Refined]:
     """Return data and attribution with the scatter that data have with the noise that was found.
 
     They are those that are given if none was found that moves chi^2 by STRONG, or mcsim does not simulate the model.
@@ -63,7 +62,7 @@ def in_words(context: DiagnosisContext) -> list[str]:
     return [f"All but the gap is tested with the scatter of {number} simulations that have the {' and '.join(titles)}."]
 
 
-def _scattered(data: DataSet[Any], model: DiagnosisContext, noise: tuple[config.Effect, ...]) -> DiagnosisContext:
+def _scattered(data: DataSet, model: DiagnosisContext, noise: tuple[config.Effect, ...]) -> DiagnosisContext:
     """Return what data are tested with, with the scatter of simulations that have noise effects."""
     analysis, ensemble = model.analysis, model.ensemble
     simulations = data.ask(null_jobs(analysis, len(ensemble.simulations), noise))
@@ -72,7 +71,7 @@ def _scattered(data: DataSet[Any], model: DiagnosisContext, noise: tuple[config.
     return replace(context(analysis, ensemble, model.bank), noise=noise, without_noise=model)
 
 
-def _noise(data: DataSet[Any], refined: Refined) -> dict[int, config.Effect]:
+def _noise(data: DataSet, refined: Refined) -> dict[int, config.Effect]:
     """Return the noise effects of the best set, or else of what is detected, at their amplitudes, by their indices.
 
     Where there are none in what is detected, it is that which explains most beside it, if that is significant: what

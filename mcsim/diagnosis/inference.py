@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -35,7 +34,7 @@ from mcsim.systematics import acts_through
 EXPLAINED = 0.5  #: share of the excess chi^2 that a single effect explains which is more likely than an exchange
 
 
-def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
+def diagnose_data(data: DataSet, case: str) -> DiagnosisResult:
     """Diagnose observed maps or measured spectra; raise InputError if they cannot be what they claim to be."""
     context = data.context
     if _is_out_of_order(data, first := Refiner(data).unrefined()):
@@ -77,7 +76,7 @@ def diagnose_data(data: DataSet[Any], case: str) -> DiagnosisResult:
     return replace(result_of(data, case, refined, reduction, notes), orders=tuple(exchanged))
 
 
-def _compared(data: DataSet[Any], refined: Refined) -> tuple[DataSet[Any], Refined, Attribution, list[str]]:
+def _compared(data: DataSet, refined: Refined) -> tuple[DataSet, Refined, Attribution, list[str]]:
     """Return data and attribution with rivals that take part, what parts of the data bear out of it, and refusals."""
     found, refusals = refined.attribution.if_named(data.context.settings), list[str]()
     if found.explanations:
@@ -95,7 +94,7 @@ def _has_noise(refined: Refined, found: Attribution) -> bool:
     return any(refined.candidates[member].parametrization.noise_alone for member in members)
 
 
-def _is_out_of_order(data: DataSet[Any], first: Refined) -> bool:
+def _is_out_of_order(data: DataSet, first: Refined) -> bool:
     """Return True if the model fits the maps in another order, and no effect alone explains much as they are."""
     gap = first.attribution.gap
     most = max((fit.delta_chi2 for fit in first.attribution.singles), default=0.0)
@@ -126,7 +125,7 @@ def confirmed(
     return found, reduction
 
 
-def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> Attribution:
+def _with_errors(data: DataSet, refined: Refined, found: Attribution) -> Attribution:
     """Return the attribution, sets with priors of nuisances in errors, the best also with its effects in the data."""
     context, every = data.context, found.explanations
 
@@ -143,7 +142,7 @@ def _with_errors(data: DataSet[Any], refined: Refined, found: Attribution) -> At
 
 
 def _scattered(
-    data: DataSet[Any], members: Sequence[int], t: Matrix, scatters: Sequence[Matrix], drawn: Sequence[int], first: Fit
+    data: DataSet, members: Sequence[int], t: Matrix, scatters: Sequence[Matrix], drawn: Sequence[int], first: Fit
 ) -> Fit:
     """Return the fit of a set with the errors that its amplitudes have with its effects in the data.
 
@@ -164,7 +163,7 @@ def _scattered(
     return fit
 
 
-def _alone(data: DataSet[Any], members: Sequence[int], drawn: int, first: Fit) -> Matrix | None:
+def _alone(data: DataSet, members: Sequence[int], drawn: int, first: Fit) -> Matrix | None:
     """Return deviations of data without a member of a fit, in the skies of its scatter; None if it draws a pattern."""
     context = data.context
     candidate = context.candidates[drawn]
@@ -179,12 +178,12 @@ def _alone(data: DataSet[Any], members: Sequence[int], drawn: int, first: Fit) -
     return data.scatter(before[:, : len(data.x)])
 
 
-def _pairs(data: DataSet[Any], groups: Sequence[Sequence[config.Effect]]) -> list[tuple[Matrix, Matrix]]:
+def _pairs(data: DataSet, groups: Sequence[Sequence[config.Effect]]) -> list[tuple[Matrix, Matrix]]:
     return [pair for own in groups if (pair := data.pair(own)) is not None]
 
 
 def _slope(
-    data: DataSet[Any],
+    data: DataSet,
     groups: Sequence[Sequence[config.Effect]],
     pairs: Sequence[tuple[Matrix, Matrix]],
     step: float,
@@ -201,7 +200,7 @@ def _slope(
     return None
 
 
-def reduction_of(data: DataSet[Any], refined: Refined) -> HeldOut | None:
+def reduction_of(data: DataSet, refined: Refined) -> HeldOut | None:
     """Fit one half of the data vector, freeze, add the effects to the simulator, and test the other half.
 
     None if there are no halves, one of them is hardly sensitive to the effects, or the half that is fitted asks for an

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from mcsim.errors import InputError
 from mcsim.support.arrays import Matrix
 
 
-def agreeing(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[Attribution, list[str]]:
+def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attribution, list[str]]:
     """Return the attribution without sets that the data cannot bear out, and a sentence on each of these.
 
     The effects of a set are simulated at their amplitudes, and these are compared in parts of the data. An effect whose
@@ -81,7 +80,7 @@ def _title(candidates: Sequence[Candidate], one: Explanation) -> str:
     return " and ".join(candidates[member].title for member in one.members)
 
 
-def slices_of(data: DataSet[Any]) -> Slices:
+def slices_of(data: DataSet) -> Slices:
     """Return the parts of a data set, in which amplitudes are compared."""
     context, z = data.context, data.extended
     beside, lmax = len(z) - len(data.x), context.analysis.model.lmax
@@ -103,7 +102,7 @@ def unconfirmed(context: DiagnosisContext, found: Attribution, reduced: bool) ->
     return f"The data vector fits {candidate.title}, which is not named: no two parts of the data measure it."
 
 
-def _actions(data: DataSet[Any], refined: Refined, one: Explanation) -> Iterator[Action]:
+def _actions(data: DataSet, refined: Refined, one: Explanation) -> Iterator[Action]:
     """Yield what each effect of a set does to the data, simulated at its amplitude if it can be.
 
     What is drawn, and a map-making that stops early, which leaves noise as well as sky, differ from sky to sky.

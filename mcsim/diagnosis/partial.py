@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -36,7 +35,7 @@ class PartialExplanation:
 class PartialSearch:
     """Add candidates to those that are detected in data, one by one."""
 
-    data: DataSet[Any]
+    data: DataSet
 
     @property
     def context(self) -> DiagnosisContext:

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,7 @@ CLEAR = 1e-6  #: global p-value up to which effects on request are tried where n
 MUCH = 0.4  #: share of the excess chi^2 that one of them explains alone then, before it is simulated at its amplitude
 
 
-def with_rivals(data: DataSet[Any], refined: Refined, found: Attribution) -> tuple[DataSet[Any], Refined] | None:
+def with_rivals(data: DataSet, refined: Refined, found: Attribution) -> tuple[DataSet, Refined] | None:
     """Return data and attribution with the effects on request that explain the data like sets that are to be named.
 
     Where nothing else explains a clear gap, they are those of one split that explain much of it alone. None if there
@@ -78,7 +77,7 @@ def _in_other_splits(rivals: Sequence[tuple[Candidate, Matrix]], index: int) -> 
             yield place
 
 
-def _alone(data: DataSet[Any], rivals: Sequence[tuple[Candidate, Matrix]]) -> Iterator[tuple[int, Matrix]]:
+def _alone(data: DataSet, rivals: Sequence[tuple[Candidate, Matrix]]) -> Iterator[tuple[int, Matrix]]:
     """Yield rivals that explain much of the excess alone, with their templates, bent where the response is.
 
     Products of what a strong gain or signal adds to maps grow with the square of its amplitude.
@@ -99,7 +98,7 @@ def _alone(data: DataSet[Any], rivals: Sequence[tuple[Candidate, Matrix]]) -> It
             yield index, t
 
 
-def _widest(data: DataSet[Any], refined: Refined, members: Sequence[int]) -> tuple[SimulatedGaussian, Vector, Matrix]:
+def _widest(data: DataSet, refined: Refined, members: Sequence[int]) -> tuple[SimulatedGaussian, Vector, Matrix]:
     """Return null distribution, data and templates, with the numbers beside the data vector if they can be added.
 
     They cannot beside members whose scatter is known, and without simulations for so many elements.
