@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 
 from mcsim import config
 from mcsim.datavector.bent import bent_templates
-from mcsim.datavector.candidate import columns_of, parts_of, scatters_of, tables_at, tables_beside
+from mcsim.datavector.candidate import Candidate, columns_of, parts_of, scatters_of, tables_at, tables_beside
 from mcsim.datavector.nuisances import with_priors
 from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
@@ -127,30 +127,25 @@ def confirmed(
 
 def _with_errors(data: DataSet, refined: Refined, found: Attribution) -> Attribution:
     """Return the attribution, sets with priors of nuisances in errors, the best also with its effects in the data."""
-    context, every = data.context, found.explanations
-
-    def errors(one: Explanation, best: bool) -> Explanation:
+    context, sets = data.context, list[Explanation]()
+    for one in found.explanations:
         members = [refined.candidates[member] for member in one.members]
         t = refined.templates[:, columns_of(context.candidates, one.members)]
-        scatters = scatters_of(refined.candidates, one.members)
-        null = context.null.with_extra_covariance(*scatters)
-        drawn = [k for k in one.members if refined.candidates[k].scatter is not None]
-        scattered = [partial(_scattered, data, one.members, t, scatters, drawn)] if best else []
-        return replace(one, fit=with_priors(null, t, one.fit, members, *scattered))
-
-    return replace(found, explanations=tuple(errors(one, place == 0) for place, one in enumerate(every)))
+        null = context.null.with_extra_covariance(*scatters_of(refined.candidates, one.members))
+        scattered = [] if sets else [partial(_scattered, data, refined.candidates, one.members, t)]
+        sets.append(replace(one, fit=with_priors(null, t, one.fit, members, *scattered)))
+    return replace(found, explanations=tuple(sets))
 
 
-def _scattered(
-    data: DataSet, members: Sequence[int], t: Matrix, scatters: Sequence[Matrix], drawn: Sequence[int], first: Fit
-) -> Fit:
+def _scattered(data: DataSet, candidates: Sequence[Candidate], members: Sequence[int], t: Matrix, first: Fit) -> Fit:
     """Return the fit of a set with the errors that its amplitudes have with its effects in the data.
 
-    ``t`` are its templates, shape (p, K), and ``scatters``, of the members ``drawn``, those with which it was made.
+    ``t`` are its templates, shape (p, K), and ``candidates`` those with whose scatter it was made.
     """
     context, fit = data.context, first
-    if scatters:
-        return with_drawn_scatter(context.null, t, fit, scatters, [_alone(data, members, k, first) for k in drawn])
+    if scatters := scatters_of(candidates, members):
+        alone = [_alone(data, members, k, first) for k in members if candidates[k].scatter is not None]
+        return with_drawn_scatter(context.null, t, fit, scatters, alone)
     with suppress(InputError):  # between what was fitted and what can be
         acting = tables_at(context.candidates, members, first)
         groups, unknown = data.in_same_skies(acting), [one for one in acting if not context.knows(one)]

@@ -102,7 +102,7 @@ def test_each_effect_of_a_set_scatters_the_skies_in_which_its_response_is_measur
     known = {"null": null, "templates": t, "settings": SimpleNamespace(nonlinear_sigma=0.5)}
     data.context = SimpleNamespace(candidates=candidates, knows=lambda table: False, **known)
     fit = null.fit(t @ [0.2, 0.1], t)
-    found = _scattered(data, [0, 1], t, [], [], fit)
+    found = _scattered(data, candidates, [0, 1], t, fit)
     assert sorted(asked) == [("calibration",), ("spectrum",)]
     # Noise that is 1.5 times as strong, and an eighth of what more is in the mean over as many skies.
     np.testing.assert_allclose(found.errors / fit.errors, np.sqrt(1.5**2 + 0.5**2 / skies), rtol=1e-9)
