@@ -10,9 +10,9 @@ from mcsim.datavector.campaign import after_jobs, null_jobs
 from mcsim.datavector.candidate import columns_of, parts_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
 from mcsim.diagnosis.refine import Refined, Refiner
-from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.support.arrays import Matrix
+from mcsim.systematics import if_possible
 
 STRONG = 1.0
 """Standard deviations of chi^2 by which noise moves its mean, from which on its scatter is simulated: with less, what
@@ -36,11 +36,10 @@ def with_found_noise(data: DataSet, refined: Refined) -> tuple[DataSet, Refined]
     if refined.attribution.verdict == "none" or model.analysis.source is not None:
         return data, refined
     for _ in range(ROUNDS):
-        try:
+        pair = None
+        with if_possible():
             noise = _noise(data, refined)
             pair = data.pair(list(noise.values())) if noise else None
-        except InputError:
-            break
         if pair is None or _moved(data.context.null, data.context.ensemble.reference, pair[1]) < STRONG:
             break
         data = replace(data, context=_scattered(data, model, tuple(noise.values())))

@@ -1,7 +1,6 @@
 """Infer from one data set whether, where, by which effects and how far it departs from the model."""
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -29,7 +28,7 @@ from mcsim.stats.gaussian import Fit
 from mcsim.stats.scattered import with_drawn_scatter, with_scatter, with_tangents
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.numbers import measured
-from mcsim.systematics import acts_through
+from mcsim.systematics import acts_through, if_possible
 
 EXPLAINED = 0.5  #: share of the excess chi^2 that a single effect explains which is more likely than an exchange
 
@@ -146,7 +145,7 @@ def _scattered(data: DataSet, candidates: Sequence[Candidate], members: Sequence
     if scatters := scatters_of(candidates, members):
         alone = [_alone(data, members, k, first) for k in members if candidates[k].scatter is not None]
         return with_drawn_scatter(context.null, t, fit, scatters, alone)
-    with suppress(InputError):  # between what was fitted and what can be
+    with if_possible():  # between what was fitted and what can be
         acting = tables_at(context.candidates, members, first)
         groups, unknown = data.in_same_skies(acting), [one for one in acting if not context.knows(one)]
         pairs = _pairs(data, groups)
@@ -154,7 +153,7 @@ def _scattered(data: DataSet, candidates: Sequence[Candidate], members: Sequence
             fit = with_scatter(context.null, t, fit, *pair)
         bend = context.null.whiten_templates(t - context.templates[:, columns_of(context.candidates, members)])
         tables = tables_beside(context.candidates, members, first, bend, context.settings.nonlinear_sigma)
-        fit = with_tangents(context.null, t, fit, [_slope(data, groups, pairs, *one) for one in tables])
+        return with_tangents(context.null, t, fit, [_slope(data, groups, pairs, *one) for one in tables])
     return fit
 
 
@@ -242,7 +241,6 @@ def reduction_of(data: DataSet, refined: Refined) -> HeldOut | None:
         pair = data.pair(acting) if noisier and not scatters else None
         return None if pair is None else (pair[0] @ matrix.T, pair[1] @ matrix.T)
 
-    try:
+    with if_possible():
         return halves.reduction(t @ free, respond, scatters, words, skies)
-    except InputError:
-        return None
+    return None

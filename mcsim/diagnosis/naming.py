@@ -11,8 +11,8 @@ from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import is_drawn
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import Attribution, Explanation
-from mcsim.errors import InputError
 from mcsim.support.arrays import Matrix
+from mcsim.systematics import if_possible
 
 
 def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attribution, list[str]]:
@@ -115,7 +115,8 @@ def _actions(data: DataSet, refined: Refined, one: Explanation) -> Iterator[Acti
         draws, scatter = refined.candidates[member].scatter is not None or candidate.parametrization.nonlinear, None
         skies, growth = context.settings.scatter_skies if draws else context.settings.constrained_skies, 1.0
         pair: tuple[Matrix, Matrix] | None = None
-        try:
+        response = t @ theta
+        with if_possible():
             effect = candidate.detected(theta, covariance)
             table = candidate.table(effect)
             simulated = data.pair_extended([table], skies)
@@ -126,8 +127,6 @@ def _actions(data: DataSet, refined: Refined, one: Explanation) -> Iterator[Acti
             response, scatter = changes.mean(axis=0), data.scatter(changes) if draws else None
             if not (draws or known):  # else its scatter is in the covariance
                 pair = simulated
-        except InputError:
-            response = t @ theta
         acting = None if draws else refined.candidates[member].acting
         variance = 1.0 if acting is None else 1.0 + max(acting.own, 0.0)
         action = Action.of(response, t, theta, variance * covariance, scatter)

@@ -10,10 +10,10 @@ from mcsim.datavector.candidate import Candidate, columns_of, coordinates_of, ef
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.selection import Selection
-from mcsim.errors import InputError
 from mcsim.stats.gaussian import Fit
 from mcsim.stats.scattered import with_drawn_scatter
 from mcsim.support.arrays import Matrix, Vector
+from mcsim.systematics import if_possible
 
 
 @dataclass(frozen=True)
@@ -97,13 +97,14 @@ class PartialSearch:
         columns, settings = np.array(columns_of(candidates, members)), self.context.settings
         fitted = self.context.null.fit(self.data.x, t[:, columns])
         for _ in range(settings.joint_rounds):
-            try:
+            response = None
+            with if_possible():
                 effects = effects_at(candidates, members, fitted)
                 tables = [candidates[member].table(effect) for member, effect in zip(members, effects, strict=True)]
                 stochastic = any(effect.parametrization.stochastic for effect in effects)
                 skies = settings.scatter_skies if stochastic else settings.constrained_skies
                 response = self.data.respond(tables, skies).mean(axis=0)
-            except InputError:
+            if response is None:
                 return None
             t = t.copy()
             at = coordinates_of(candidates, members, effects)

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import TextIO
 
 from mcsim.ensemble.store import refuse_unwritable
 from mcsim.errors import InputError, RunError
@@ -79,18 +80,27 @@ def _linked(scratch: str, lock: Path) -> bool:
     return True
 
 
+def _taken(stream: TextIO, own: bool) -> bool:
+    """Take the kernel's lock of a file that no live process holds; False if another run of this process has it."""
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | (fcntl.LOCK_NB if own else 0))
+    except BlockingIOError:
+        return False
+    except OSError:  # a disk without such locks
+        return not own
+    return True
+
+
 def _remove_if_dead(lock: Path, path: Path) -> None:
     """Remove the lock of a dead process; raise InputError for that of a live one."""
     with suppress(FileNotFoundError), lock.open() as stream:
         host, _, number = stream.read().partition(" ")
         process = int(number) if number.isdecimal() else 0
         own = process == os.getpid()
-        if host == socket.gethostname() and process and (own or not alive(process)):
-            with suppress(BlockingIOError):  # another run of this process holds it
-                fcntl.flock(stream, fcntl.LOCK_EX | (fcntl.LOCK_NB if own else 0))
-                # If several processes find a dead lock, one removes it, and none removes a newer lock.
-                if os.fstat(stream.fileno()).st_ino == lock.stat().st_ino:
-                    lock.unlink()
-                return
+        if host == socket.gethostname() and process and (own or not alive(process)) and _taken(stream, own):
+            # If several processes find a dead lock, one removes it, and none removes a newer lock.
+            if os.fstat(stream.fileno()).st_ino == lock.stat().st_ino:
+                lock.unlink()
+            return
         who = f"process {process} on {host}" if process else "process 0 on an unknown host"
         raise InputError(f"Another run writes to {path} ({who}); wait for it, or remove {lock} if it is gone.")

@@ -224,8 +224,9 @@ def _dataset(survey: Survey, found: dict[tuple[int, int], Means]) -> xr.Dataset:
             mean[numbers], scatter[numbers] = bins, np.full(bins.shape, np.nan)
     # Build the sums of two realizations with these variances, so that the summary's own code makes the dataset.
     result = summary.dataset(layout, Sums(2, mean, scatter, comoment), plan.attributes(run))
-    for name in mean:
-        result[f"{name}_standard_error"].values[:] = np.sqrt(scatter[name] / run.ensemble.realizations)
+    for variable in result.data_vars.values():
+        if "_standard_error" in str(variable.name):  # of both parts too
+            variable.values[:] *= np.sqrt(2.0 / run.ensemble.realizations)
     result["count"].values[...] = run.ensemble.realizations
     return result
 

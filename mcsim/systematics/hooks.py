@@ -1,8 +1,9 @@
 """The hooks by which an effect acts, and what those of a user's effect may return."""
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -43,15 +44,16 @@ class HookError(InputError):
     """A hook of an effect that fails, or returns what it should not: never a reason to leave the effect out."""
 
 
-@contextmanager
-def if_possible() -> Iterator[None]:
+class _IfPossible(AbstractContextManager[None, bool]):
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
+        return isinstance(error, InputError) and not isinstance(error, HookError)
+
+
+def if_possible() -> AbstractContextManager[None, bool]:
     """Leave a block where an effect cannot have what it is given; a hook that fails stays a :class:`HookError`."""
-    try:
-        yield
-    except HookError:
-        raise
-    except InputError:
-        pass
+    return _IfPossible()
 
 
 def guard(kind: type) -> None:

@@ -1,5 +1,6 @@
 """A hook that fails at the amplitude of the data ends a diagnosis: it is no reason to call the gap unknown."""
 
+import pickle
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +34,41 @@ class Wider(Effect):
         if abs(self.amplitude) > 0.1:
             raise ZeroDivisionError("of a user")
         return replace(beam, blm=beam.blm * np.exp(-self.amplitude * (np.arange(beam.lmax + 1.0) / 40.0) ** 2))
+
+
+def test_a_hook_that_fails_in_any_simulation_of_a_diagnosis_ends_it():
+    """It was taken for an amplitude that cannot be: a set lost its response, or a reduction was "not measured"."""
+    run, settings = config.load(two_channels("small")), DiagnosisSettings(beam_orders=2)
+    library = {name: systematics.get(name) for name in ("beam_width", "noise_level")}
+    analysis = analysis_of(run, settings=settings, library=library)
+    known = context(analysis, *campaign.learned(analysis, ask, 260, time_ordered=False))
+    acting = [
+        config.Effect(name=name, channel="V1", parameters={"amplitude": amplitude})
+        for name, amplitude in (("beam_width", 0.15), ("noise_level", 0.4))
+    ]
+    maps = list(simulate.maps(survey(campaign.with_effects(run, acting)), 0))
+    answers: dict[bytes, list] = {}
+    calls: list[bytes] = []
+
+    def recorded(jobs):
+        calls.append(key := pickle.dumps(jobs))
+        if key not in answers:
+            answers[key] = list(ask(jobs))
+        return answers[key]
+
+    diagnose_data(ObservedMaps(known, maps, recorded), "both")
+    asked = len(calls)
+    assert asked > 5
+    for last in range(1, asked + 1):
+
+        def failing(jobs, last=last):
+            if len(calls) + 1 == last:
+                raise HookError("effect of a user: its beam fails")
+            return recorded(jobs)
+
+        calls.clear()
+        with refused("of a user", by=HookError):
+            diagnose_data(ObservedMaps(known, maps, failing), "both")
 
 
 def test_a_hook_that_fails_at_the_fitted_amplitude_ends_the_diagnosis():

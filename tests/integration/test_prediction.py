@@ -140,3 +140,11 @@ def test_what_predictions_do_not_cover_is_said() -> None:
     differencing = {"kind": "differencing", "model": "wmap_focal_plane", "pair": "W1", "sample_period_s": 61.44}
     with refused("W1", "hit_averaged"):
         prediction.predict(table(channel=[{"name": "W1", "beam": BEAM, "scan": differencing}]))
+
+
+def test_errors_of_both_parts_of_a_prediction_add_up_to_its_own() -> None:
+    """Those of the parts were of two realizations, whatever the run has."""
+    found = prediction.predict("tiny")
+    for kind in ("", "_circular"):
+        whole, *parts = (found[f"biposh{kind}_binned_standard_error{part}"].values for part in ("", "_real", "_imag"))
+        np.testing.assert_allclose(np.hypot(*parts), whole, rtol=1e-9)

@@ -1,6 +1,7 @@
 """What goes wrong around a run: two writers, changed files, cuts at awkward moments, stores that do not fit."""
 
 import errno
+import fcntl
 import os
 import shutil
 import socket
@@ -18,7 +19,7 @@ from zarr.storage import _local
 
 from mcsim import Moments, config, open_ensemble, open_summary
 from mcsim.ensemble import plan, runner, store
-from mcsim.ensemble.lock import locked
+from mcsim.ensemble.lock import holder, locked
 from mcsim.errors import RunError
 from mcsim.instrument.scan import write_moments_fits
 from refusals import refused
@@ -60,6 +61,20 @@ def test_a_store_behind_a_link_is_that_store(
     link.symlink_to(tmp_path / "disk" / "merged.zarr")
     runner.merge([small_store], link)
     assert_same(tmp_path / "disk" / "merged.zarr", small_store)
+
+
+def test_a_disk_without_kernel_locks_keeps_no_lock_of_a_dead_process(tmp_path: Path, monkeypatch) -> None:
+    def flock(*_: object) -> None:
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+    path, lock = tmp_path / "x.zarr", tmp_path / "x.zarr.lock"
+    lock.write_text(f"{socket.gethostname()} {dead.stdout.strip()}")
+    with locked(path):
+        assert lock.read_text() == holder()
+        with refused("x.zarr", os.getpid()), locked(path):
+            pass
 
 
 def test_lock_of_a_dead_process_is_taken_over(small_store: Path, client: Client, tmp_path: Path) -> None:
