@@ -10,7 +10,8 @@ Instrument: `Beam`, `ScanModel`, `Moments`, and what they make of one sky: `obse
 Statistics: `biposh` of maps at hand, `predict` of a run, `fit` of an effective beam, `prepare` and `diagnose` of maps
 with `DiagnosisSettings`, also by the simulator of another program, an `ExternalModel`; `limit` of what maps can tell
 with `LimitSettings`, `compare` of two simulations.
-Systematic effects: `effects`, and `Effect` to write one. Bad input raises `InputError`.
+Systematic effects: `effects`, and `Effect` to write one. Bad input raises `InputError`, and what could not go
+on for another reason `RunError`.
 
 Names are loaded when they are first used, so that ``import mcsim`` costs little.
 """
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from mcsim.ensemble.prediction import predict
     from mcsim.ensemble.prepare import prepare
     from mcsim.ensemble.runner import merge, run
-    from mcsim.errors import InputError
+    from mcsim.errors import InputError, RunError
     from mcsim.information.api import limit
     from mcsim.information.settings import LimitSettings
     from mcsim.instrument.beams import Beam
@@ -51,6 +52,7 @@ __all__ = [
     "LimitSettings",
     "Moments",
     "RunConfig",
+    "RunError",
     "ScanModel",
     "__version__",
     "biposh",
@@ -79,6 +81,7 @@ _HOME = {
     "LimitSettings": "mcsim.information.settings",
     "Moments": "mcsim.instrument.scan",
     "RunConfig": "mcsim.config",
+    "RunError": "mcsim.errors",
     "ScanModel": "mcsim.instrument.scan",
     "biposh": "mcsim.bipolar.dataset",
     "compare": "mcsim.comparison.api",

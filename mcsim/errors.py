@@ -32,4 +32,13 @@ class InputError(ValueError):
 
 
 class RunError(RuntimeError):
-    """A run that could not go on, though its input was right; what is finished is stored. Exit code 1."""
+    """What could not go on, though its input was right; what a run has finished is stored. Exit code 1.
+
+    Examples
+    --------
+    >>> import mcsim
+    >>> try:
+    ...     result = mcsim.run("tiny", "tiny.zarr")
+    ... except mcsim.RunError as error:
+    ...     print(error)  # the scheduler is lost, say: call it again to go on
+    """

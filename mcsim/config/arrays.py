@@ -123,9 +123,10 @@ def kept(write: Callable[[Path], Any], what: str) -> Path:
             name = f"given-{hashlib.sha256(contents.encode()).hexdigest()}"
             return folders.cached(name, move).absolute()
     except OSError as error:
-        raise (RunError if folders.is_full(error) else InputError)(
-            f"cache folder {str(root)!r} cannot take what is given as {what} ({error.strerror}); make room there, or "
-            "set MCSIM_CACHE to one that can."
+        kind, room = (RunError, "make room there, or ") if folders.is_full(error) else (InputError, "")
+        raise kind(
+            f"cache folder {str(root)!r} cannot take what is given as {what} ({error.strerror}); {room}set "
+            "MCSIM_CACHE to one that can."
         ) from None
 
 

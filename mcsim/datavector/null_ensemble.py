@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 from mcsim.datavector.candidate import Column, TemplateBank
 from mcsim.datavector.summaries import Element, pair_classes
-from mcsim.ensemble.store import write_dataset
+from mcsim.ensemble.datasets import write_dataset
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates, held_out_pvalues
 from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_in_folds, calibrate_on
 from mcsim.support.arrays import Matrix, Vector, divided

@@ -18,7 +18,7 @@ from mcsim.diagnosis.consistency import Comparison
 from mcsim.diagnosis.control_result import Controls
 from mcsim.diagnosis.fitted import CandidateResult, EffectResult, EffectSet
 from mcsim.diagnosis.selection import Contrast, Verdict
-from mcsim.ensemble.store import write_dataset
+from mcsim.ensemble.datasets import write_dataset
 from mcsim.errors import InputError
 from mcsim.reconstruction.result import HEAD, Reconstructed
 from mcsim.stats.excess import HeldOut, Measured, excess_of

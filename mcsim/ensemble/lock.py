@@ -20,12 +20,12 @@ from mcsim.support.processes import alive
 
 
 @contextmanager
-def locked(path: Path) -> Iterator[None]:
+def locked(path: Path) -> Iterator[bool]:
     """Hold the store for one run, or raise InputError: a file ``{path}.lock`` beside it names host and process.
 
-    The lock of a dead process of this host is taken over.
+    The lock of a dead process of this host is taken over; yield True then, for it may have left more behind.
     """
-    lock = _lock_of(path)
+    lock, inherited = _lock_of(path), False
     with ExitStack() as stack:
         with refuse_unwritable(path):
             lock.parent.mkdir(parents=True, exist_ok=True)
@@ -39,10 +39,11 @@ def locked(path: Path) -> Iterator[None]:
                     fcntl.flock(held, fcntl.LOCK_EX)
                 while not _linked(scratch, lock):
                     _remove_if_dead(lock, path)
+                    inherited = True
             finally:
                 os.unlink(scratch)
         try:
-            yield
+            yield inherited
         finally:
             with suppress(OSError):  # if the disk has become read-only, the next run takes the lock over
                 lock.unlink()
@@ -51,6 +52,15 @@ def locked(path: Path) -> Iterator[None]:
 def holder() -> str:
     """Return what the lock of a store that this process holds says: host and process."""
     return f"{socket.gethostname()} {os.getpid()}"
+
+
+def is_held(path: Path) -> bool:
+    """Return True if a run writes to a store, for all that this host knows."""
+    try:
+        host, _, number = _lock_of(path).read_text().partition(" ")
+    except OSError:
+        return False
+    return host != socket.gethostname() or not number.isdecimal() or alive(int(number))
 
 
 def check_held(path: Path, by: str) -> None:

@@ -1,5 +1,6 @@
 """Lazy opening of stored ensembles with xarray."""
 
+import time
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,11 +9,14 @@ from mcsim.bipolar import Mode
 from mcsim.config.preparation import frame_of
 from mcsim.ensemble import store
 from mcsim.ensemble.layout import Layout
-from mcsim.errors import InputError
+from mcsim.ensemble.lock import is_held
+from mcsim.errors import InputError, RunError
 from mcsim.support.folders import user_path
 
 if TYPE_CHECKING:
     import xarray as xr
+
+WAITS_S = (0.2, 1.0, 5.0)  #: before what a run replaces is looked for again
 
 
 def open_ensemble(path: str | Path) -> "xr.Dataset":
@@ -101,6 +105,18 @@ def open_summary(path: str | Path) -> "xr.Dataset":
 
 
 def _opened(path: Path, group: str | None) -> "xr.Dataset":
+    """Open a group lazily, again where a run has just taken away what it replaces."""
+    for wait_s in WAITS_S:
+        try:
+            return _found(path, group)
+        except RunError:
+            if not is_held(path):
+                raise
+            time.sleep(wait_s)
+    return _found(path, group)
+
+
+def _found(path: Path, group: str | None) -> "xr.Dataset":
     """Open a group lazily; load its coordinates and ``done``, by which xarray selects rows."""
     import xarray as xr  # here: workers start sooner without it
 

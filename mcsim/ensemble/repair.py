@@ -91,7 +91,7 @@ def mend(path: Path, layout: Layout, attributes: Mapping[str, Any], quiet: bool 
     Broken metadata and coordinates, or lost attributes of the store itself, are rebuilt from the ``layout`` and
     ``attributes`` of its configuration.
     """
-    _sweep(path)
+    sweep(path)
     lost = {}
     if store.headless(path):
         store.restore_attributes(path, layout, {**attributes, **store.origin(path)})
@@ -105,12 +105,13 @@ def mend(path: Path, layout: Layout, attributes: Mapping[str, Any], quiet: bool 
     return replace(verdict, broken=broken | verdict.broken)
 
 
-def _sweep(path: Path) -> None:
-    """Remove the remains of killed writers: partial files and temporary folders."""
+def sweep(path: Path) -> None:
+    """Remove the remains of killed writers of a store that no run writes to: partial files and temporary folders."""
     for left in path.rglob("*.partial"):
         left.unlink(missing_ok=True)
     scratch = re.compile(rf"\.{re.escape(path.name)}\.[a-z0-9_]{{8}}")  # tempfile's names
-    for left in [entry for entry in path.absolute().parent.iterdir() if scratch.fullmatch(entry.name)]:
+    beside, inside = path.absolute().parent.iterdir(), path.glob(".*")
+    for left in [entry for entry in (*beside, *inside) if scratch.fullmatch(entry.name)]:
         if left.is_file():
             left.unlink(missing_ok=True)
         shutil.rmtree(left, ignore_errors=True)

@@ -1,16 +1,17 @@
-"""The ensemble store: one Zarr 3 group per run. This is the only module that uses zarr.
+"""The ensemble store: one Zarr 3 group per run.
 
 Arrays have the dimensions (realization, pair, mode, ell) and are chunked along realization alone. One task writes whole
 chunks, ``done`` last. A realization exists only if ``done`` is True.
 """
 
 import asyncio
+import json
 import os
 import shutil
 import tempfile
 import warnings
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -19,18 +20,16 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 from zarr.codecs import ZstdCodec
-from zarr.core.buffer import Buffer
 from zarr.core.sync import sync
 from zarr.storage import MemoryStore
 
+from mcsim.ensemble.datasets import Files, write_dataset, write_files
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.errors import InputError, RunError
-from mcsim.support.folders import appearing, is_full, outside_stores, real_path, remove, unwritable
+from mcsim.support.folders import is_full, outside_stores, unwritable, write_whole
 
 if TYPE_CHECKING:
     import xarray as xr
-
-Files = dict[str, Buffer]  #: contents of the files of a store, by their paths in it
 
 _CODECS: dict[str, Any] = {"compressors": (ZstdCodec(level=1, checksum=True),)}
 # Write chunks of fill values too, so that a missing file means damage.
@@ -66,7 +65,8 @@ def check_writable(path: Path) -> Path:
         folder = folder.parent
     with refuse_unwritable(path):
         for place in (folder, path) if path.is_dir() else (folder,):
-            tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=place).cleanup()
+            with tempfile.TemporaryFile(dir=place):
+                pass
     return folder
 
 
@@ -98,7 +98,7 @@ def create(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
         if layout.kept_npix is not None:
             group[layout.kept_name].attrs.update(layout.kept_attributes())
         _consolidate(MemoryStore(files))
-        _write_files(files, Path(scratch) / "new")
+        write_files(files, Path(scratch) / "new")
         os.replace(Path(scratch) / "new", path)
 
 
@@ -318,15 +318,25 @@ def extend(path: Path, realizations: int, update: Mapping[str, Any]) -> None:
 
 
 def write_summary(path: Path, summary: "xr.Dataset") -> None:
-    """Replace the summary group."""
+    """Replace the summary group: whoever reads meanwhile finds one of both, or none."""
     with faults_named(path), tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         form: Any = {"zarr_format": 3, "write_empty_chunks": True, "consolidated": False}
         encoding = {name: _CODECS | _absent_value(array.dtype) for name, array in summary.variables.items()}
         write_dataset(summary, Path(scratch) / "summary", encoding=encoding, **form)
-        shutil.rmtree(path / "summary", ignore_errors=True)
-        _consolidate(path)  # what ends before the next time has no summary, instead of one that is described wrongly
+        _forget_summary(path)  # what ends before the metadata are written has none, not one that is described wrongly
+        with suppress(FileNotFoundError):
+            os.replace(path / "summary", Path(scratch) / "former")
         os.replace(Path(scratch) / "summary", path / "summary")
         _consolidate(path)
+
+
+def _forget_summary(path: Path) -> None:
+    """Take the summary out of the consolidated metadata, by which xarray finds it."""
+    whole = json.loads((path / "zarr.json").read_bytes())
+    named = (whole.get("consolidated_metadata") or {}).get("metadata", {})
+    for name in [name for name in named if name.split("/")[0] == "summary"]:
+        del named[name]
+    write_whole(path / "zarr.json", json.dumps(whole))
 
 
 def _absent_value(dtype: np.dtype) -> dict[str, Any]:
@@ -334,28 +344,6 @@ def _absent_value(dtype: np.dtype) -> dict[str, Any]:
     if dtype.kind == "i":
         return {"fill_value": np.iinfo(dtype).min}
     return {"fill_value": complex(np.nan, np.nan)} if dtype.kind == "c" else {}
-
-
-def write_dataset(dataset: "xr.Dataset", folder: Path, **form: Any) -> None:
-    """Write a dataset that is in memory to a folder, in place of what is there, as :meth:`xarray.Dataset.to_zarr`.
-
-    What is there stays if the new one cannot be written.
-    """
-    files: Files = {}
-    with warnings.catch_warnings():
-        # Zarr warns that consolidated metadata, which xarray looks for, are not yet standard.
-        warnings.simplefilter("ignore", category=UserWarning)
-        dataset.to_zarr(MemoryStore(files), **({"consolidated": True} | form))
-    with appearing(folder) as scratch:
-        _write_files(files, scratch)
-        remove(real_path(folder))
-
-
-def _write_files(files: Files, folder: Path) -> None:
-    """Write what zarr made in memory: on a disk it hands every small file to a thread, several times."""
-    for name, content in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(content.to_bytes())
 
 
 def summarised(path: Path) -> tuple[int, list[int]]:

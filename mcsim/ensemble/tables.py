@@ -13,7 +13,7 @@ import xarray as xr
 from astropy.io.fits.verify import VerifyWarning
 from astropy.table import Table
 
-from mcsim.ensemble.store import write_dataset
+from mcsim.ensemble.datasets import write_dataset
 from mcsim.errors import InputError
 from mcsim.support.folders import unreadable, unwritable, user_path, writable
 

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from mcsim.datavector.candidate import Candidate, columns_of, numbered
-from mcsim.ensemble.store import write_dataset
+from mcsim.ensemble.datasets import write_dataset
 from mcsim.information.fisher import Information, ordered_pairs, variance_of_mean
 from mcsim.information.settings import LimitSettings
 from mcsim.stats.detection import snr_needed, snr_to_separate

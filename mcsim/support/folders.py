@@ -269,9 +269,10 @@ def cached(name: str, fill: Callable[[Path], None]) -> Path:
         except OSError as error:
             if error.errno is None:  # from a connection or a timeout, not from a file
                 raise
-            raise (RunError if is_full(error) else InputError)(
-                f"cache folder {str(root)!r} cannot be written ({error.strerror}); make room there, or set MCSIM_CACHE "
-                "to one that can."
+            kind, room = (RunError, "make room there, or ") if is_full(error) else (InputError, "")
+            raise kind(
+                f"cache folder {str(root)!r} cannot be written ({error.strerror}); {room}set "
+                "MCSIM_CACHE to one that can."
             ) from None
     return folder
 

@@ -5,6 +5,7 @@ import errno
 import json
 import os
 import shutil
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from zarr.core import sync
 
 from mcsim import cli
 from mcsim.ensemble import describe, opening, repair, runner, store, tables
+from mcsim.ensemble.lock import locked
 from mcsim.errors import RunError
 from mcsim.plot.spectra import ensemble_figure
 from refusals import refused
@@ -100,13 +102,9 @@ def test_a_summary_that_the_store_does_not_describe_is_made_again(
     resume: bool, small_store: Path, client: Client, copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The last that a run writes is the metadata of all: a disk may be full by then, or the run killed."""
-    consolidated, done = store._consolidate, []
 
     def ended(path: Path) -> None:
-        if done:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        done.append(path)
-        consolidated(path)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     shutil.rmtree(copy / "summary")
     monkeypatch.setattr(store, "_consolidate", ended)
@@ -123,6 +121,21 @@ def test_a_summary_that_the_store_does_not_describe_is_made_again(
     assert_same(copy, small_store)
     with opening.open_summary(copy) as found, opening.open_summary(small_store) as expected:
         xr.testing.assert_identical(found.load(), expected.load())
+
+
+def test_a_summary_that_a_run_replaces_is_waited_for(copy: Path) -> None:
+    """Of a store without its lock it is damage. Read beside the metadata of the one that was going it was NaN."""
+    expected = opening.open_summary(copy).load()
+    store._forget_summary(copy)
+    with pytest.raises(KeyError, match="summary"):  # the reader of xarray is told, too
+        xr.open_zarr(copy, group="summary")
+    with refused("copy.zarr", by=RunError):
+        opening.open_summary(copy)
+    with locked(copy):
+        later = threading.Timer(0.1, store.write_summary, (copy, expected))
+        later.start()
+        xr.testing.assert_identical(opening.open_summary(copy).load(), expected)
+        later.join()
 
 
 @pytest.mark.parametrize("part", ["biposh/c/1", "cl", "ell/c/0", "summary/cl_mean"])

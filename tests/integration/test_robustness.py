@@ -63,25 +63,48 @@ def test_a_store_behind_a_link_is_that_store(
     assert_same(tmp_path / "disk" / "merged.zarr", small_store)
 
 
+def lock_of_the_dead(path: Path) -> Path:
+    """Make the lock of a store whose process is gone."""
+    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+    lock = path.with_name(f"{path.name}.lock")
+    lock.write_text(f"{socket.gethostname()} {dead.stdout.strip()}")
+    return lock
+
+
 def test_a_disk_without_kernel_locks_keeps_no_lock_of_a_dead_process(tmp_path: Path, monkeypatch) -> None:
     def flock(*_: object) -> None:
         raise OSError(errno.ENOSYS, "Function not implemented")
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
-    path, lock = tmp_path / "x.zarr", tmp_path / "x.zarr.lock"
-    lock.write_text(f"{socket.gethostname()} {dead.stdout.strip()}")
+    path = tmp_path / "x.zarr"
+    lock = lock_of_the_dead(path)
     with locked(path):
         assert lock.read_text() == holder()
         with refused("x.zarr", os.getpid()), locked(path):
             pass
 
 
+def test_what_a_killed_run_or_merge_left_goes_with_its_lock(small_store: Path, client: Client, tmp_path: Path) -> None:
+    """It took a --resume, which nobody asks of a store that is finished."""
+    run, merged = tmp_path / "x.zarr", tmp_path / "m.zarr"
+    runner.run(table(**ensemble(4)), run, workers=client)
+    left = [tmp_path / ".m.zarr.abcd1234", tmp_path / ".x.zarr.abcd1234", run / "cl" / "zarr.0123456789abcdef.partial"]
+    for path in left:
+        path.touch()
+    runner.run(table(), run, workers=client)
+    assert all(one.exists() for one in left)  # those of others, for all that is known
+    left.append(run / ".x.zarr.abcd1234")
+    left[-1].mkdir()
+    lock_of_the_dead(run)
+    runner.run(table(**ensemble(11)), run, workers=client)
+    lock_of_the_dead(merged)
+    runner.merge([small_store], merged)
+    assert not any(one.exists() for one in left)
+    assert_same(merged, small_store)
+
+
 def test_lock_of_a_dead_process_is_taken_over(small_store: Path, client: Client, tmp_path: Path) -> None:
-    dead = subprocess.run(
-        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True, check=True
-    )
-    (tmp_path / "x.zarr.lock").write_text(f"{socket.gethostname()} {dead.stdout.strip()}")
+    lock_of_the_dead(tmp_path / "x.zarr")
     runner.run(table(), tmp_path / "x.zarr", workers=client)
     assert_same(tmp_path / "x.zarr", small_store)
     assert not (tmp_path / "x.zarr.lock").exists()
@@ -185,7 +208,7 @@ def test_merge_on_a_full_disk_names_the_store_to_make(
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    for module, name in ((_local, "_put"), (store, "_write_files")):
+    for module, name in ((_local, "_put"), (store, "write_files")):
         with monkeypatch.context() as patch, refused("merged.zarr", by=RunError, errno=errno.ENOSPC) as caught:
             patch.setattr(module, name, full)
             runner.merge([small_store], tmp_path / "merged.zarr")

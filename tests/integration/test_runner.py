@@ -7,6 +7,7 @@ import shutil
 import signal
 import sys
 from contextlib import nullcontext
+from copy import deepcopy
 from pathlib import Path
 
 import dask
@@ -365,3 +366,17 @@ def test_workers_start_before_an_interruption_ends_them(times: int, monkeypatch:
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_clusters_of_two_threads_leave_dask_and_the_script_as_they_were() -> None:
+    """The one that ended last restored what the other one had set."""
+    main = sys.modules["__main__"]
+    before, spec = deepcopy(dask.config.config), main.__spec__
+    first, last = cluster._settings_of_all(), cluster._settings_of_all()
+    first.__enter__()
+    last.__enter__()
+    first.__exit__(None, None, None)
+    assert dask.config.get("distributed.worker.multiprocessing-method") == cluster.start_method()
+    last.__exit__(None, None, None)
+    assert dask.config.config == before
+    assert main.__spec__ is spec

@@ -38,7 +38,7 @@ ORDER = (
 
 # The only packages that may import what stands on the left of them.
 RESERVED = {
-    "zarr": {"mcsim.ensemble.store"},
+    "zarr": {"mcsim.ensemble.datasets", "mcsim.ensemble.store"},
     "dask": {"mcsim.ensemble.runner"},
     "distributed": {"mcsim.ensemble.runner"},
     "pydantic": {"mcsim.config", "mcsim.datavector", "mcsim.diagnosis"},

@@ -42,6 +42,7 @@ NAMES = [
     "LimitSettings",
     "Moments",
     "RunConfig",
+    "RunError",
     "ScanModel",
     "__version__",
     "biposh",

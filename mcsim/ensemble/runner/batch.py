@@ -70,16 +70,13 @@ def run(
     ------
     InputError
         For bad input, an unwritable or foreign store, or a scheduler that does not answer. The store is unchanged.
+    RunError
+        If the disk is full, or scheduler or workers are lost. What is finished is stored: call it again to go on.
 
     Returns
     -------
     Result
         ``store``, the numbers of realizations ``finished`` in all and ``computed`` now, and the ``failures``.
-
-    Notes
-    -----
-    Workers are processes, which import the main module again: in a script, keep the call under
-    ``if __name__ == "__main__":``.
 
     Examples
     --------
@@ -114,7 +111,8 @@ def run(
             with reporting("normalisation of the filter", 1.0, "", quiet) as report:
                 shared.filtering.fisher(report)
         simulate.draw_sky(shared, wanted.start)  # finds bad sky files before a store is made
-        stack.enter_context(locked(target))
+        if stack.enter_context(locked(target)):
+            repair.sweep(target)
         stack.enter_context(_written_down(journal, loaded, wanted))
         if resume:
             _mend(target, shared, journal, quiet)

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from itertools import islice
@@ -60,6 +60,42 @@ QUIET = {
     "distributed.admin.system-monitor.interval": "2s",
 }
 """Settings of Dask without which each worker is asked a hundred times a second what it does: 4 % of a core."""
+
+
+@contextmanager
+def _settings() -> Iterator[None]:
+    """Set what Dask asks of this process while it has local workers, some of whom may have to be started again."""
+    settings = QUIET | {
+        "distributed.nanny.pre-spawn-environ": _environment(),
+        "distributed.worker.multiprocessing-method": start_method(),
+    }
+    with dask.config.set(settings), _script_left_alone():
+        yield
+
+
+class _Shared:
+    """Enter a block once for all threads: the first one enters it, and the last one leaves it.
+
+    What a block restores at its end is what it found: of two that overlap, the one that ends last would restore what
+    the other one had set.
+    """
+
+    def __init__(self, block: Callable[[], AbstractContextManager[None]]) -> None:
+        self.block, self.lock, self.inside, self.entered = block, threading.Lock(), 0, ExitStack()
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        with self.lock:
+            if not self.inside:
+                self.entered.enter_context(self.block())
+            self.inside += 1
+        try:
+            yield
+        finally:
+            with self.lock:
+                self.inside -= 1
+                if not self.inside:
+                    self.entered.close()
 
 
 @contextmanager
@@ -146,6 +182,10 @@ def _environment() -> dict[str, str]:
     return {"PYTHONHASHSEED": "6640"} | given | single | _KEPT_MEMORY  # the first as distributed has it
 
 
+_settings_of_all = _Shared(_settings)
+_STARTING = threading.Lock()  #: distributed loads modules when a cluster starts, not all of which two threads may
+
+
 @contextmanager
 def local_client(workers: int) -> Iterator[Client]:
     """Yield the client of a local cluster of single-threaded processes, with ports open to this machine alone."""
@@ -154,23 +194,18 @@ def local_client(workers: int) -> Iterator[Client]:
             "A worker of multiprocessing.Pool can start no workers of its own; call mcsim from the main process, or "
             "from a concurrent.futures.ProcessPoolExecutor."
         )
-    environment = _environment()
-    whole = dict(os.environ) | environment
-    settings = QUIET | {
-        "distributed.nanny.pre-spawn-environ": environment,
-        "distributed.scheduler.allowed-failures": ATTEMPTS - 1,
-        "distributed.worker.multiprocessing-method": start_method(),
-        "distributed.worker.preload": [_WORKER_SETUP.format(variables=set(whole))],
-    }
-    with dask.config.set(settings), _script_left_alone(), ExitStack() as stack:
+    whole = dict(os.environ) | _environment()
+    with _settings_of_all(), ExitStack() as stack:
         try:
-            with _interrupted_later():
+            with _STARTING, _interrupted_later():
                 cluster = stack.enter_context(
                     LocalCluster(
                         n_workers=workers,
                         threads_per_worker=1,
                         processes=True,
                         env=whole,
+                        preload=[_WORKER_SETUP.format(variables=set(whole))],
+                        scheduler_kwargs={"allowed_failures": ATTEMPTS - 1},
                         host="127.0.0.1",
                         dashboard_address="127.0.0.1:0",
                         memory_limit=None,

@@ -3,13 +3,13 @@
 import os
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcsim.ensemble import opening, plan, store, summary
+from mcsim.ensemble import opening, plan, repair, store, summary
 from mcsim.ensemble.lock import locked
 from mcsim.ensemble.runner.batch import Result
 from mcsim.ensemble.tasks import empty, summarise_node
@@ -70,12 +70,11 @@ def merge(paths: Iterable[str | Path], path: str | Path, quiet: bool = True) -> 
     layout = opening.layout(sources[0], size)
     first["configuration"]["ensemble"]["realizations"] = size
     place = store.check_writable(target)
-    with (
-        _disk_named(target),
-        locked(target),
-        tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=place) as folder,
-    ):
+    with _disk_named(target), locked(target) as inherited, ExitStack() as stack:
         _check_new(target)  # once more: another one may have ended just before
+        if inherited:
+            repair.sweep(target)
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=place))
         scratch = Path(folder) / "merged"
         store.create(scratch, layout, first)
         there = np.zeros(size, dtype=bool)
