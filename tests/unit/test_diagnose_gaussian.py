@@ -6,7 +6,13 @@ from scipy import stats
 
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.summaries import Element
-from mcsim.stats.gaussian import SimulatedGaussian, nested_pvalue, residual_pvalue
+from mcsim.stats.gaussian import (
+    SimulatedGaussian,
+    Tolerated,
+    held_out_pvalues,
+    nested_pvalue,
+    residual_pvalue,
+)
 from mcsim.stats.look_elsewhere import Calibration, calibrate, calibrate_in_folds, global_test, scan_pvalues
 from refusals import refused
 
@@ -229,3 +235,22 @@ def test_calibration_with_nuisances_is_the_same_for_the_mean_of_any_number_of_sk
         found.append(ensemble.calibration(null, groups).held_out_combined)
     assert null.scale_variance > 0.02
     np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
+
+
+def test_a_variance_that_is_estimated_adds_its_error_to_that_of_the_covariance():
+    """Reciprocals of the degrees of freedom add: 40 and 40 are 20, and not the fewer of both."""
+    n, dimension = 100, 61
+    found = nested_pvalue(8.0, 60.0, 1, dimension, n, Tolerated(0.0, 1.5, 40.0))
+    f = (n - dimension + 1.0) * 8.0 / (n + 60.0 - 8.0) / 1.5
+    assert found == pytest.approx(stats.f.sf(f, 1, 20.0), rel=1e-9)
+
+
+def test_pvalues_of_simulations_whose_scale_scatters_are_uniform():
+    """Each against all others: the scatter of their scale, a tenth, makes large chi^2 more frequent."""
+    rng, count, level = np.random.default_rng(4), 3000, 0.01
+    x = rng.normal(size=(count, 30)) * np.sqrt(rng.gamma(10.0, 0.1, size=(count, 1)))
+    null = SimulatedGaussian.from_simulations(x)
+    # That of 3000 values has an error of 0.004: five sigma.
+    assert null.scale_variance == pytest.approx(0.1, abs=0.02)
+    share = np.mean(held_out_pvalues(x, null) < level)
+    assert abs(share - level) < 4.0 * np.sqrt(level * (1.0 - level) / count)

@@ -9,7 +9,7 @@ from mcsim.datavector.candidate import Candidate
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import calibrate
-from mcsim.stats.scattered import Acting, Beside, with_scatter, with_tangents
+from mcsim.stats.scattered import Acting, Beside, with_drawn_scatter, with_scatter, with_tangents
 from mcsim.systematics import Effect
 
 P, SKIES = 12, 4000
@@ -158,3 +158,51 @@ def test_without_a_change_of_the_scatter_errors_stay() -> None:
     model, t = SimulatedGaussian.from_simulations(rng.normal(size=(500, P))), rng.normal(size=(P, 1))
     found, skies = model.fit(5.0 * t[:, 0], t), rng.normal(size=(8, P))
     np.testing.assert_allclose(with_scatter(model, t, found, skies, skies + t[:, 0]).covariance, found.covariance)
+
+
+def test_the_error_of_a_growth_is_that_of_many_sets_of_skies() -> None:
+    """Along eleven templates, which are independent: a response that grows with the data, and scatters besides."""
+    rng, model, groups = np.random.default_rng(1), SimulatedGaussian(np.zeros(P), np.eye(P), 10**9), list(range(P))
+    found = []
+    for _ in range(300):
+        before = rng.normal(size=(40, P))
+        after = 1.5 * before + 0.3 * rng.normal(size=(40, P)) + 30.0 * np.eye(P)[0]
+        acting = Acting.of(model, np.eye(P), [(k,) for k in groups], 0, (before, after))
+        found.append([acting.excess[1:], acting.error[1:]])
+    excess, error = np.moveaxis(found, 1, 0)
+    # The variance of 3300 values has a relative error of sqrt(2/3300), and a little more for their tails: 4 sigma.
+    assert np.mean(error) == pytest.approx(np.var(excess), rel=0.12)
+
+
+def test_less_scatter_makes_nothing_beside_it_more_significant() -> None:
+    acting = Acting(100.0, 3.0, 0.1, np.array([0.0, -0.6]), np.array([0.0, 0.01]))
+    found = Beside.of([acting, None], None).tolerated(np.zeros(1), np.array([[0]]), np.array([[1.0]]), np.array([[1]]))
+    np.testing.assert_array_equal(found.variance, [[1.0]])
+
+
+def test_a_response_that_grows_along_another_template_moves_that_amplitude() -> None:
+    """At the fit the first response is t_1 + t_2/2: theta_1 = y_1 and theta_2 = y_2 - y_1/2."""
+    model, t = SimulatedGaussian(np.zeros(P), np.eye(P), 1_000_000), np.eye(P)[:, :2]
+    found = model.fit(20.0 * t[:, 0], t)
+    bent = with_tangents(model, t, found, [(t[:, 0] + 0.5 * t[:, 1])[None], None])
+    np.testing.assert_allclose(bent.errors / found.errors, [1.0, np.sqrt(1.25)], rtol=1e-9)
+
+
+@pytest.mark.parametrize(("slope", "wider"), [(1e-2, 100.0), (1e-4, 1.0)])
+def test_slopes_that_are_nearly_flat_tell_no_errors(slope: float, wider: float) -> None:
+    """At the peak of a response the error would be 10,000 times that of the line."""
+    model, t = SimulatedGaussian(np.zeros(P), np.eye(P), 1_000_000), np.eye(P)[:, :2]
+    found = model.fit(20.0 * t[:, 0], t)
+    bent = with_tangents(model, t, found, [slope * t[:, :1].T, None])
+    np.testing.assert_allclose(bent.errors / found.errors, [wider, 1.0], rtol=1e-6)
+
+
+def test_noise_that_a_response_multiplies_counts_with_what_it_adds_to() -> None:
+    """Along the template it is tripled: a variance of nine, one and four and twice the product of both."""
+    null, rng, t = SimulatedGaussian(np.zeros(P), np.eye(P), 10**9), np.random.default_rng(2), np.eye(P)[:, :1]
+    noise = rng.normal(size=(P, 50))
+    noise -= noise.mean(axis=1, keepdims=True)
+    noise = np.linalg.qr(noise.T)[0].T  # whose covariance is exactly one
+    scatter = 2.0 * t @ t.T @ noise
+    found = null.with_extra_covariance(scatter).fit(10.0 * t[:, 0], t)
+    assert with_drawn_scatter(null, t, found, [scatter], [noise]).errors[0] == pytest.approx(3.0, rel=1e-6)

@@ -63,3 +63,15 @@ def test_the_snr_at_a_power_is_that_of_the_probit():
     few = intervals.snr_at_power("", s[:20], s[:20] == s[:20].max())
     assert few.low <= few.high
     assert np.isfinite([few.value, few.low, few.high]).all()
+
+
+def test_the_interval_of_what_is_removed_holds_it():
+    """The ends of the interval of a ratio change places where the ratio is taken from one."""
+    rng = np.random.default_rng(0)
+    found = intervals.removed("x", np.stack([rng.uniform(5, 9, 50), rng.uniform(1, 3, 50)], axis=1))
+    assert found.low < found.value < found.high
+
+
+def test_nineteen_cases_tell_no_snr():
+    strengths = np.linspace(1.0, 9.0, 19)
+    assert np.isnan(intervals.snr_at_power("x", strengths, strengths > 5.0).value)
