@@ -169,17 +169,35 @@ def test_exact_power_spectrum_is_that_of_the_convolved_sky(channel_x):
 def test_leading_order_misses_second_order_only(channel_x, channel_y):
     """Scaling every b_l,m>0 by 1/10 scales what leading order misses by 1/100 (it is quadratic)."""
 
-    def missing(factor):
-        scaled = []
-        for channel in (channel_x, channel_y):
-            blm = channel.beam.blm.copy()
-            blm[1:] *= factor
-            scaled.append(ScannedBeam(blm, channel.beam.w))
-        modes = [mode for mode in ALL_MODES if mode[0] > 0]
-        exact = cmb_biposh_exact(modes, CL, LMAX, *scaled)
-        return exact - cmb_biposh_leading(modes, CL, LMAX, *scaled), abs(np.nan_to_num(exact)).max()
-
-    full, size = missing(1.0)
-    tenth, _ = missing(0.1)
+    beams, modes = (channel_x.beam, channel_y.beam), [mode for mode in ALL_MODES if mode[0] > 0]
+    full, size = missing_at_leading_order(modes, beams, 1.0)
+    tenth, _ = missing_at_leading_order(modes, beams, 0.1)
     assert np.nanmax(abs(full)) > 0.05 * size
     np.testing.assert_allclose(tenth, full / 100, atol=1e-12 * size, rtol=0)
+
+
+def test_leading_order_of_weighted_maps_misses_second_order_only(channel_x, channel_y):
+    """The first order of either map's beam goes with the weights of both."""
+    beams, rng = [], np.random.default_rng(3)
+    for channel in (channel_x, channel_y):
+        w, middle = channel.beam.w.copy(), 2 * LMAX
+        w[0, 1:3, middle] = rng.normal(size=2)
+        w[0, 2, middle + 1] = 0.3 - 0.5j
+        w[0, 2, middle - 1] = -w[0, 2, middle + 1].conj()
+        beams.append(ScannedBeam(channel.beam.blm, w))
+    modes = [(2, 0, 0), (2, 1, 1), (1, 0, 1)]
+    full, size = missing_at_leading_order(modes, beams, 1.0)
+    tenth, _ = missing_at_leading_order(modes, beams, 0.1)
+    assert np.nanmax(abs(full)) > 0.01 * size
+    np.testing.assert_allclose(tenth, full / 100, atol=1e-12 * size, rtol=0)
+
+
+def missing_at_leading_order(modes, beams, factor):
+    """What leading order misses if every b_l,m>0 has this factor, and the size of the whole."""
+    scaled = []
+    for beam in beams:
+        blm = beam.blm.copy()
+        blm[1:] *= factor
+        scaled.append(ScannedBeam(blm, beam.w))
+    exact = cmb_biposh_exact(modes, CL, LMAX, *scaled)
+    return exact - cmb_biposh_leading(modes, CL, LMAX, *scaled), abs(np.nan_to_num(exact)).max()

@@ -84,18 +84,28 @@ def test_single_map_information_is_the_quadratic_sum_of_its_modes():
     np.testing.assert_allclose(np.hypot(low, high), each, rtol=1e-12)
 
 
+def test_degrees_without_power_tell_nothing_and_maps_that_are_nearly_the_same_tell_much():
+    """Of a correlation of 0.999 at l = 2 and more, and of maps without monopole and dipole."""
+    cl = np.zeros((2, 2, 6))
+    cl[..., 2:] = np.array([[1.0, 0.999], [0.999, 1.0]])[:, :, None]
+    signal = np.zeros((2, 2, 1, 6), dtype=complex)
+    signal[0, 0, 0, 1:] = [7.0, 0.0, 1.0, 0.0, 0.0]
+    inverse = np.linalg.inv(cl[:, :, 3])
+    assert fisher_information(signal, [(2, 0, 0)], cl) == pytest.approx(0.5 * inverse[0, 0] ** 2, rel=1e-9)
+
+
 def test_variances_of_isotropic_maps():
     """E|A|^2 from 4000 pairs of Gaussian maps, held to 5 of the mean's own standard errors."""
     rng = np.random.default_rng(7)
     draws, lmax = 4000, 3
-    x_cl, y_cl, cross = np.full(4, 2.0), np.full(4, 3.0), np.full(4, 1.5)
-    mixing = np.linalg.cholesky([[2.0, 1.5], [1.5, 3.0]])
+    x_cl, y_cl, cross = np.array([4.0, 3.0, 2.0, 1.0]), np.array([1.0, 3.0, 5.0, 2.0]), np.array([1.0, 1.5, 2.0, -1.0])
+    mixing = np.linalg.cholesky(np.moveaxis([[x_cl, cross], [cross, y_cl]], -1, 0))
     alm = np.zeros((2, draws, lmax + 1, 2 * lmax + 1), dtype=complex)
     for ell in range(lmax + 1):
         for m in range(ell + 1):
             real, imaginary = rng.standard_normal((2, 2, draws))
             white = real if m == 0 else (real + 1j * imaginary) / sqrt(2)
-            alm[:, :, ell, lmax + m] = mixing @ white
+            alm[:, :, ell, lmax + m] = mixing[ell] @ white
             alm[:, :, ell, lmax - m] = (-1) ** m * alm[:, :, ell, lmax + m].conj()
     modes = [(1, 0, 0), (1, 1, 1), (2, 0, 0), (2, 1, 0), (2, 2, -1), (3, 0, 1)]
     for channels, expected in (

@@ -7,7 +7,8 @@ import wignernj
 from scipy.special import sph_harm_y
 
 from mcsim.bipolar.modes import modes as all_modes
-from mcsim.bipolar.theory import FULL_SKY, Spectra, isotropic_variance, overlap, pseudo_spectrum
+from mcsim.bipolar.theory import FULL_SKY, Spectra, isotropic_variance, map_harmonics, overlap, pseudo_spectrum
+from mcsim.bipolar.theory.circles import circles
 from mcsim.ensemble import summary
 from mcsim.ensemble.layout import Layout
 
@@ -175,3 +176,23 @@ def test_weights_of_few_degrees_have_bins_that_reach_further(size: int, reach: i
     np.testing.assert_allclose(found.autos[: len(known.autos)], known.autos, atol=1e-12)
     for mode in ((0, 0, 0), (2, 0, 0), (2, 1, 2)):
         np.testing.assert_allclose(found.around.beside(mode, 0), known.around.beside(mode, 0), atol=1e-10)
+
+
+def test_products_along_circles_are_those_of_their_fourier_coefficients() -> None:
+    """f_{d+n} f_{d-n}, also where n is above d, of a weight without symmetry."""
+    reach, d_max = 3, 1
+
+    def weight(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+        return 1.0 + 0.5 * x - 0.3 * y + 0.4 * z + 0.6 * x * y - 0.5 * y * z + 0.3 * x * y * z
+
+    harmonics = map_harmonics(weight(*np.array(healpy.pix2vec(16, np.arange(12 * 16**2)))), 3)
+    found = circles((harmonics, harmonics, harmonics), 1.0, reach, d_max)
+    gamma, phi = (2.0 * np.pi * np.arange(count) / count for count in (32, 64))
+    n, d = np.arange(reach + 1), np.arange(d_max + 1)[:, None]
+    for place, theta in enumerate(found.theta):
+        south = np.stack([np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), np.full(phi.size, -np.sin(theta))])
+        east = np.stack([-np.sin(phi), np.cos(phi), np.zeros(phi.size)])
+        along = weight(*(south[..., None] * np.cos(gamma) + east[..., None] * np.sin(gamma)))
+        f = np.fft.fft(along) / gamma.size
+        # The harmonics are sums over pixels, good to a few times 1e-4.
+        np.testing.assert_allclose(found.cross[..., place], np.mean(f[:, d + n] * f[:, d - n], axis=0), atol=2e-3)
