@@ -227,6 +227,12 @@ def test_mmax_is_chosen_and_the_rest_reported(tmp_path) -> None:
     assert beam.neglected_power == pytest.approx(closed.neglected_power, rel=1e-6)
 
 
+def test_a_coarse_map_has_as_many_degrees_as_its_pixels_resolve() -> None:
+    """Half a degree: a wave of two pixels is l = 360."""
+    theta, phi = directions(61, (30, 30))
+    assert Beam.from_map(ellipse(theta, phi), pixel_deg=0.5).lmax == 360
+
+
 def test_plane_of_a_cube_and_given_pixel(tmp_path) -> None:
     theta, phi = directions(100, (50, 50))
     cube = np.stack([ellipse(theta, phi), np.ones_like(theta), ellipse(theta, phi, 20, 12)])

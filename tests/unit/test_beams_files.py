@@ -1,5 +1,6 @@
 """Beams from files of coefficients."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import healpy
@@ -89,6 +90,12 @@ def test_other_normalisation_in_l_is_refused(tmp_path, beam, power) -> None:
 def test_all_zero_file_is_refused(tmp_path, beam) -> None:
     with refused("m = 0", "pole"):
         Beam.from_blm(write(tmp_path / "beam.alm.fits", Beam(0 * beam.blm)), 120)
+
+
+def test_a_saved_beam_that_is_not_normalised_is_refused(tmp_path, beam) -> None:
+    replace(beam, blm=2.0 * beam.blm).save(tmp_path / "twice.npz")
+    with refused("twice.npz", "b_00"):
+        Beam.from_blm(tmp_path / "twice.npz")
 
 
 def test_unreadable_files_are_refused(tmp_path, beam) -> None:

@@ -154,6 +154,8 @@ def test_beams_of_a_run_are_shown_as_far_as_their_files_reach(tmp_path):
     [
         (WINDOW[:30], (29, 40)),
         (WINDOW**0.5 * 1.5, (1.5,)),
+        (0.9 * WINDOW, (0.9,)),
+        (1.03 * WINDOW, (1.03,)),
         (np.append(WINDOW, np.nan), ()),
         (np.append(WINDOW, 2.0), (2.0,)),
     ],

@@ -59,6 +59,18 @@ def test_gain_of_every_half_is_kept_apart(monkeypatch: pytest.MonkeyPatch, site:
     assert second == pytest.approx(-first, rel=0.1)
 
 
+def test_pixels_that_no_ring_of_a_part_crosses_have_the_gain_of_all_rings(site: systematics.Site) -> None:
+    """A part that is the first ring of the year, on which the gain is a hundredth."""
+    drift, year = systematics.get("gain_drift")(amplitude=0.01, phase_deg=0.0), (0.0, 1.0)
+    all_rings, first_ring = (mean_gain((drift,), site, Part(year, rings)) for rings in (None, (10**6, 0)))
+    assert all_rings is not None
+    assert first_ring is not None
+    crossed = np.any(first_ring != all_rings, axis=0)
+    assert 0 < crossed.sum() < 10
+    np.testing.assert_allclose(first_ring[0, crossed], 0.01, rtol=1e-3)
+    assert np.std(first_ring[0, ~crossed].real) > 1e-3
+
+
 @dataclass(frozen=True, kw_only=True)
 class SaturatedDrift(systematics.Effect):
     """A gain that is not linear in its amplitude."""

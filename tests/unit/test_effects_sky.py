@@ -134,12 +134,14 @@ def test_dipole_residual_adds_a_vector(site, sky, points):
 
 
 def test_spectrum_rescales_its_bands(site, sky):
-    effect = systematics.get("spectrum")(amplitude=0.5, bands=(0.0, 3.0, 4.0, 0.0, 0.0, 0.0))
+    """The first one begins at l = 2: monopole and dipole stay."""
+    effect, sky = systematics.get("spectrum")(amplitude=0.7, bands=(2.0, 3.0, 6.0, 0.0, 0.0, 0.0)), sky + 1.0
     found, ell = effect.sky(sky, site, draw), alm_.degrees(LMAX)
     edges = [2 + i * (LMAX - 1) // 6 for i in range(7)]
     assert edges[-1] == LMAX + 1
     factor = np.ones(LMAX + 1)
-    factor[edges[1] : edges[2]], factor[edges[2] : edges[3]] = np.sqrt(1.3), np.sqrt(1.4)
+    for band, power in enumerate((1.2, 1.3, 1.6)):
+        factor[edges[band] : edges[band + 1]] = np.sqrt(power)
     np.testing.assert_allclose(found, sky * factor[ell], rtol=1e-14)
     with refused("spectrum", -2):
         systematics.get("spectrum")(amplitude=2.0, bands=(-1.0, 0.0, 0.0, 0.0, 0.0, 0.0)).sky(sky, site, draw)

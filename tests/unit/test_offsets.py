@@ -15,7 +15,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import MapGrid, Moments, ScanModel, read_moments, write_moments_fits
 from mcsim.instrument.scan.offsets import exponents
 from mcsim.instrument.scan.pointing import pointing
-from mcsim.simulation import simulate
+from mcsim.simulation import sampled, simulate
 from mcsim.simulation.offsets import Expansion, expansion, offset_maps, transforms
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
@@ -274,6 +274,77 @@ def test_an_error_of_the_gain_scales_all_that_offsets_do(splits, effect, factors
     whole = simulate.maps(made, 0, sky=sky + dipole)
     for found, seen, factor in zip(change, whole, factors, strict=True):
         np.testing.assert_allclose(found, factor * seen, atol=1e-9 * np.std(seen))
+
+
+@pytest.mark.parametrize("order", [1, 2, 4])
+def test_an_error_of_the_gain_scales_what_samples_see_that_are_nearer_to_the_centres(order, sky, beam) -> None:
+    run, library = table(MODEL, beam, sky, offset_order=order), {**catalogue(), Constant.name: Constant}
+    nearer = {"name": "pixelization", "channel": "W1", "amplitude": 0.5}
+    gain = {"name": "constant", "channel": "W1", "amplitude": 0.01}
+    before, after = (
+        simulate.maps(survey(config.load(run | {"effect": effects}), library=library), 0)[0]
+        for effects in ([nearer], [nearer, gain])
+    )
+    np.testing.assert_allclose(after - before, 0.01 * before, atol=1e-9 * np.std(before))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wave(Constant):
+    """A gain that changes along the scan within a pixel."""
+
+    name = "wave"
+
+    def gain(self, time_s: np.ndarray, site: Site) -> np.ndarray:
+        return self.amplitude * np.sin(2.0 * np.pi * time_s / 7.0)
+
+
+def test_a_gain_that_changes_inside_a_pixel_counts_to_first_order_at_any_order_of_the_offsets(sky) -> None:
+    """Against single samples."""
+    left = {}
+    for order in (1, 4):
+        run = table(MODEL, Beam.gaussian(900.0, lmax=LMAX), sky, offset_order=order)
+        wave, library = {"name": "wave", "channel": "W1", "amplitude": 0.01}, {**catalogue(), Wave.name: Wave}
+        made, acting = (survey(config.load(run | {"effect": own}), library=library) for own in ([], [wave]))
+        change = simulate.maps(acting, 0)[0] - simulate.maps(made, 0)[0]
+        true = sampled.maps(acting, 0)[0][1] - sampled.maps(made, 0)[0][1]
+        left[order] = np.std(change - true) / np.std(true)
+    assert left[1] < 0.2
+    assert left[4] < 1.05 * left[1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Round(Constant):
+    """A true beam that lacks all orders of the fiducial one but m = 0."""
+
+    name = "round"
+
+    def beam(self, beam: Beam, site: Site) -> Beam:
+        return beam.circular()
+
+    def gain(self, time_s: np.ndarray, site: Site) -> None:
+        return None
+
+
+def test_a_dipole_is_taken_off_through_orders_that_the_true_beam_lacks() -> None:
+    """Through the fiducial beam, which a dipole shows at m = 1; against single samples."""
+    blm = Beam.gaussian(900.0, lmax=LMAX).blm * np.array([[1.0], [0.3]])
+    blm[1, 0] = 0.0
+    run = table(MODEL, Beam(blm), np.zeros(alm_.size(LMAX), dtype=complex))
+    run["sky"] |= {"dipole_uk": 3000.0}
+    run["effect"] = [{"name": "round", "channel": "W1", "amplitude": 1.0}]
+    made = survey(config.load(run), library={**catalogue(), Round.name: Round})
+    found, true = simulate.maps(made, 0)[0], sampled.maps(made, 0)[0][1]
+    assert np.std(true) > 10.0
+    assert np.std(found - true) < 0.1 * np.std(true)
+
+
+@pytest.mark.parametrize("factor", [0.5, -1.0])
+def test_powers_of_offsets_that_shrink_are_those_of_shrunk_offsets(streamed, factor) -> None:
+    found = streamed.shrunk(factor)
+    np.testing.assert_allclose(found.dtheta, factor * streamed.dtheta)
+    np.testing.assert_allclose(found.dphi, factor * streamed.dphi)
+    powers = factor ** np.array([2] * 3 + [3] * 4 + [4] * 5)
+    np.testing.assert_allclose(found.offset_moments, powers[:, None] * streamed.offset_moments)
 
 
 def test_orders_that_cannot_be_are_refused(sky, beam, streamed) -> None:

@@ -107,6 +107,14 @@ def test_ring_and_latitude_means_of_single_pixels():
     assert scan_factors(moments, [2]).sky_mean == pytest.approx(1.0 / 3.0)
 
 
+def test_hits_by_latitude_are_over_the_mean_of_the_whole_sky():
+    """Where one half of the sky is seen: over the mean of that half they would be 0.5."""
+    north = np.cos(THETA) > 0.0
+    moments = Moments(NSIDE, "ecliptic", north.astype(float), np.zeros((2, THETA.size), dtype=complex))
+    hits, _ = latitude_means(moments, (0, 45, 90))
+    np.testing.assert_allclose(hits, 1.0, atol=0.03)  # the equator's pixels count as the south's
+
+
 def test_summary_says_what_each_number_is(year):
     text = summary("WMAP", year)
     assert "nside 64, ecliptic frame, 1.57788e+07 samples" in text
