@@ -181,6 +181,17 @@ def test_finished_realizations_that_lack_files_are_not_opened_as_nan(part: str, 
     assert int(opening.open_summary(copy)["count"]) == 10
 
 
+def test_a_finished_realization_that_lacks_one_number_of_its_spectra_is_damaged(copy: Path) -> None:
+    """BipoSH that do not exist are none, too, in every realization: of spectra all exist."""
+    rows = store.read(copy, 4, 8)
+    done, rows["cl"][1, 0, 3] = rows.pop("done"), np.nan
+    store.write(copy, 4, rows, done)
+    with refused("copy.zarr", 5, "--resume", by=RunError):
+        store.read(copy, 4, 8)
+    (damage,) = repair.verify(copy).damages
+    assert damage.lost == (5,)
+
+
 def test_absent_numbers_of_a_summary_are_none(copy: Path) -> None:
     """Whoever opens a store without mcsim."""
     for part in ("biposh_mean/c/0/0/0", "cl_mean/c/0/0", "count/c"):

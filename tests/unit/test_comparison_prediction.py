@@ -44,6 +44,13 @@ def test_no_smoothing_makes_the_sky_vanish():
     assert Smoothing().amplitude(Smoothing().within(np.array([1e6]))) == pytest.approx(9.0)
 
 
+@pytest.mark.parametrize("value", [1.0, -0.5, 0.2])
+def test_a_smoothing_of_the_other_side_undoes_it(value):
+    """Variances of the Gaussian are over that of the beam of the side that is smoothed."""
+    back = Smoothing().inverse(np.array([value]))[0]
+    assert (1.0 + value) * (1.0 + back) == pytest.approx(1.0)
+
+
 def test_no_response_to_an_effect_is_larger_than_the_sky():
     """Two effects that make nearly the same maps may cancel each other at any amplitude but for this."""
     run, sky = mcsim.load_config("tiny"), np.zeros(healpy.Alm.getsize(47), complex)

@@ -23,7 +23,7 @@ from mcsim.beamfit import (
     with_covariance_of,
 )
 from mcsim.beamfit import fit as fit_to_any_order
-from mcsim.beamfit.data import SUMMARY, Row, project
+from mcsim.beamfit.data import SUMMARY, Row, Scaling, project
 from mcsim.beamfit.templates import templates
 from mcsim.bipolar import parse_mode
 from mcsim.bipolar.theory import ScannedBeam, cmb_biposh_leading
@@ -207,6 +207,14 @@ def test_a_factor_above_one_is_the_angle_zero(shared):
     assert angles.symmetric_error_deg > 0.0
     with refused("orientation", "constant"):
         orientation(fit(expected(shared, rescaled(shared, 1.01)), shared))
+
+
+def test_bins_end_where_the_other_degree_of_a_pair_does():
+    """At d = -1 it is the higher one: data up to l = 5 have l2 up to 4."""
+    mode = parse_mode("L1M1d-1")
+    raw = Scaling(bennett=False, spectrum=False, summary=False)
+    found = project([Row(mode, 2, 7, False)], raw, {mode: np.arange(10.0) + 0j}, highest=5)
+    assert found == pytest.approx([3.0])  # of 2, 3 and 4
 
 
 @pytest.mark.parametrize(("normalisation", "scaling"), [("WMAP", "l(l+1)/2pi"), ("Hajian-Souradeep", "none")])

@@ -66,6 +66,14 @@ def test_comparison_of_nested_models():
         compare(large, small)
 
 
+def test_the_drop_of_chi2_by_few_simulations_is_that_of_its_probability():
+    """Of F with the parameters that are added, and with those of 30 simulations that the larger model leaves."""
+    design = np.column_stack([DESIGN, np.arange(P) ** 2])
+    small, large = (solve(DATA, design[:, :count], COVARIANCE, 30) for count in (1, 3))
+    found = compare(small, large)
+    assert stats.f.sf(found.drop / 2.0, 2, 29 - (P - 1) + 1) == pytest.approx(found.probability, rel=1e-9)
+
+
 def test_each_realization_is_weighted_by_the_others():
     drawn = RNG.normal(size=(30, P)) @ ROOT.T
     found = solve_each(drawn, DESIGN)
@@ -121,6 +129,8 @@ def test_size_bounds_the_shift_of_every_parameter():
     assert np.all(np.abs(shift) <= size(change, COVARIANCE, None) * errors)
     assert size(change, COVARIANCE, None) == pytest.approx(np.sqrt(change @ np.linalg.inv(COVARIANCE) @ change))
     assert size(change, COVARIANCE, 10**8) == pytest.approx(size(change, COVARIANCE, None), rel=1e-6)
+    # The inverse of a covariance of n + 1 simulations is too large by n/(n - P - 1) in the mean.
+    assert size(change, COVARIANCE, 30) == pytest.approx(np.sqrt((29 - P - 1) / 29) * size(change, COVARIANCE, None))
 
 
 def test_models_of_different_data_are_not_compared():

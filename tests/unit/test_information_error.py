@@ -29,6 +29,16 @@ def test_variance_of_a_mean_over_pairs(size: int) -> None:
     assert error < 0.15 * square.mean()
 
 
+def test_pairs_whose_means_are_alike_by_chance_have_half_the_variance_of_independent_ones() -> None:
+    """Without bias it would be less than nothing."""
+    n, k = 6, np.arange(6)
+    pairs = np.array([0.0, 2.0, -1.0, 5.0, -1.0, 2.0])[(k[:, None] - k) % n]
+    off = pairs[~np.eye(n, dtype=bool)]
+    assert np.ptp(np.sum(pairs, axis=1)) == 0.0
+    second = np.sum((off - off.mean()) ** 2) / (n * (n - 3))  # of n (n - 3)/2 pairs that are free, each twice
+    assert variance_of_mean(pairs) == pytest.approx(second / (n * (n - 1)))
+
+
 def test_three_probes_have_the_jackknife() -> None:
     (pairs,) = sets_of_pairs(3, 5, 1)
     left_out = [np.delete(np.delete(pairs, k, 0), k, 1)[0, 1] for k in range(3)]
