@@ -127,7 +127,7 @@ def test_a_summary_that_a_run_replaces_is_waited_for(copy: Path) -> None:
     """Of a store without its lock it is damage. Read beside the metadata of the one that was going it was NaN."""
     expected = opening.open_summary(copy).load()
     store._forget_summary(copy)
-    with pytest.raises(KeyError, match="summary"):  # the reader of xarray is told, too
+    with refused("summary", by=KeyError):  # the reader of xarray is told, too
         xr.open_zarr(copy, group="summary")
     with refused("copy.zarr", by=RunError):
         opening.open_summary(copy)
