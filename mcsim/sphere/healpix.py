@@ -252,6 +252,9 @@ HITS = ("N_OBS", "HITS", "NOBS", "HIT", "NHITS")
 VARIANCE = ("II_COV", "VARIANCE", "I_VAR", "COV_II", "VAR_I", "VAR")
 """Names of columns with the variance of the temperature."""
 
+PIXEL = ("PIXEL", "PIX", "IPIX")
+"""Names of columns with the numbers of the pixels."""
+
 POLARISATION = tuple(f"{stokes}{end}" for stokes in "QU" for end in ("", "_STOKES", "_POLARISATION", "_POLARIZATION"))
 """Names of columns with Stokes parameters other than the temperature, in the maps of Planck and of healpy."""
 
@@ -268,8 +271,9 @@ def read_map(
 
     It is the column that is called one of ``names``; without names the temperature, or else the first column. A file
     with a single column need not name it, unless it holds something else: its temperature, which was read already
-    (``alone`` False), or what its name, one of ``other``, says. Pixels of the value that the header calls BAD_DATA
-    become ``bad``. A .npy file holds an array of shape (npix,) in RING order; its frame and unit are None. Raise
+    (``alone`` False), or what its name, one of ``other``, says. Pixels of the value that the header of the table, or
+    else of the file, calls BAD_DATA become ``bad``, those of a column's TNULL and those that a table with pixel numbers
+    does not list UNSEEN. A .npy file holds an array of shape (npix,) in RING order; its frame and unit are None. Raise
     InputError if the file cannot be read as a HEALPix map, does not say whether it is RING or NESTED, names an unknown
     frame, or another one than ``frame``, or has a BAD_DATA that is no number.
     """
@@ -284,24 +288,21 @@ def read_map(
         raise InputError(f"{path} does not exist; give a HEALPix map in FITS.")
     with unreadable(path, "a HEALPix map", "give a complete FITS map"), warnings.catch_warnings():
         warnings.simplefilter("error", category=AstropyUserWarning)
-        field = _column_called(path, names, alone, other)
-        map_, header = healpy.read_map(path, dtype=float, h=True, field=field)
-    keywords = dict(header)
-    if str(keywords.get("ORDERING", "")).strip().upper() not in ("RING", "NESTED"):
-        raise InputError(f"{path} does not say how its pixels are ordered; write ORDERING = RING or NESTED there.")
-    # A map with explicit pixel indices has them in its first column and the values in its second.
-    column = (2 if str(keywords.get("INDXSCHM", "")).strip().upper() == "EXPLICIT" else 1) + field
-    unit = str(keywords.get(f"TUNIT{column}", "")).strip() or None
+        with opened(path) as hdus:
+            table = first_table(hdus)
+            place, number = _columns_of(path, table, names, alone, other)
+            map_ = _in_ring_order(path, table, place, number)
+            keywords, found = table.header, stated_frame(hdus, str(path))
+            bad_data = keywords.get("BAD_DATA", hdus[0].header.get("BAD_DATA"))
+    unit = str(keywords.get(f"TUNIT{number + 1}", "")).strip() or None
     if str(keywords.get("TEMPTYPE", "")).strip().upper().startswith("ANT"):
         unit = f"{unit or 'K'} antenna"
-    with opened(path) as hdus:
-        found = stated_frame(hdus, str(path))
     if frame is not None and found not in (None, frame):
         raise InputError(
             f'{path} is in {found} coordinates, but it is needed in {frame} ones; set map.frame = "{found}", so that '
             "the scan and the noise are computed there, or rotate it."
         )
-    return _replaced(np.asarray(map_), keywords.get("BAD_DATA"), bad, path), found, unit
+    return _replaced(map_, bad_data, bad, path), found, unit
 
 
 def _replaced(map_: Map, stated: object, bad: float, path: Path) -> Map:
@@ -334,20 +335,73 @@ def read_uk_and_unit(path: Path, frame: str, frequency_ghz: float | None) -> tup
     return np.where(map_ > UNSEEN_BELOW, to_uk(unit, path, frequency_ghz) * map_, map_), unit
 
 
-def _column_called(path: Path, names: tuple[str, ...], alone: bool, other: tuple[str, ...]) -> int:
-    """Return the number of the map called one of ``names`` (none: of temperature), not counting pixel indices."""
-    with opened(path) as hdus:
-        table = first_table(hdus)
-        columns = [name.upper() for name in table.columns.names]
-        explicit = str(table.header.get("INDXSCHM", "")).strip().upper() == "EXPLICIT"
-    columns = columns[1:] if explicit else columns
+def _columns_of(
+    path: Path, table: fits.BinTableHDU | fits.TableHDU, names: tuple[str, ...], alone: bool, other: tuple[str, ...]
+) -> tuple[int | None, int]:
+    """Return the places of the columns of pixel numbers, None without one, and of the map called one of ``names``.
+
+    Without names it is that of temperature, or else the first one.
+    """
+    columns = [str(name).strip().upper() for name in table.columns.names]
+    scheme, extent = (str(table.header.get(key, "")).strip().upper() for key in ("INDXSCHM", "OBJECT"))
+    place = next((number for number, name in enumerate(columns) if name in PIXEL), None)
+    if place is None and (scheme == "EXPLICIT" or (scheme != "IMPLICIT" and extent == "PARTIAL")):
+        place = 0
+    maps = {name: number for number, name in reversed(list(enumerate(columns))) if number != place}
     for name in names or TEMPERATURE:
-        if name in columns:
-            return columns.index(name)
-    if ((len(columns) == 1 and alone) or not names) and columns[0] not in other:
-        return 0
+        if name in maps:
+            return place, maps[name]
+    first = min(maps.values(), default=None)
+    if first is not None and ((len(maps) == 1 and alone) or not names) and columns[first] not in other:
+        return place, first
     names = names or TEMPERATURE
     raise InputError(f"{path} has the columns {', '.join(columns)} and none called {' or '.join(names)}; name it so.")
+
+
+def _in_ring_order(path: Path, table: fits.BinTableHDU | fits.TableHDU, place: int | None, number: int) -> Map:
+    """Return a column of a table as a whole map in RING order, ``healpy.UNSEEN`` where it has no value."""
+    header, column = table.header, table.columns[number]
+    order = str(header.get("ORDERING", "")).strip().upper()
+    if order not in ("RING", "NESTED", "NEST"):
+        raise InputError(f"{path} does not say how its pixels are ordered; write ORDERING = RING or NESTED there.")
+    values = np.ravel(table.data.field(number))
+    if values.dtype.kind not in "biuf":
+        raise InputError(f"{path} has no real numbers in its column {column.name}; give a map.")
+    map_ = values.astype(np.float64)
+    if isinstance(column.null, int | np.integer):
+        map_[map_ == column.null * (column.bscale or 1.0) + (column.bzero or 0.0)] = healpy.UNSEEN
+    stated = header.get("NSIDE")
+    if stated is None and place is not None:
+        raise InputError(f"{path} has pixel numbers, but no NSIDE; write it into the header of the table.")
+    npix = map_.size if stated is None else 12 * int(stated) ** 2
+    if place is not None:
+        map_ = _whole(path, np.ravel(table.data.field(place)), map_, npix)
+    if map_.size != npix or not healpy.isnpixok(npix):
+        states = "no NSIDE" if stated is None else f"NSIDE = {stated}, which is of {npix} pixels,"
+        raise InputError(
+            f"{path} has {map_.size} pixels and {states} in its header; give all 12 nside^2 pixels, or their numbers "
+            "in a column PIXEL."
+        )
+    map_[healpy.mask_bad(map_)] = healpy.UNSEEN  # in single precision too
+    return map_ if order == "RING" else np.asarray(healpy.reorder(map_, n2r=True))
+
+
+def _whole(path: Path, pixels: NDArray, values: Map, npix: int) -> Map:
+    """Return a map of ``npix`` pixels with the values of those that are listed; InputError for what lists no pixels."""
+    wrong = pixels.size != values.size or pixels.dtype.kind not in "iuf" or not np.all(pixels == np.floor(pixels))
+    if wrong or (pixels.size and not 0 <= pixels.min() <= pixels.max() < npix):
+        extent = "" if wrong else f", but {pixels.min():g} to {pixels.max():g}"
+        raise InputError(
+            f"{path} has pixel numbers that are not whole ones from 0 to {npix - 1}, one for each value{extent}; "
+            "correct them or NSIDE."
+        )
+    listed = pixels.astype(np.int64)
+    twice = np.flatnonzero(np.bincount(listed, minlength=1) > 1)
+    if twice.size:
+        raise InputError(f"{path} lists pixel {twice[0]} more than once ({twice.size} such pixels); list each once.")
+    map_ = np.full(npix, healpy.UNSEEN)
+    map_[listed] = values
+    return map_
 
 
 def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> Cl:
