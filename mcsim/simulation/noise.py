@@ -256,7 +256,8 @@ def _positive(path: Path, moments: Moments, names: Sequence[str], alone: bool = 
 
     ``alone``: a file with a single column holds it, whatever it is called.
     """
-    other = (*healpix.POLARISATION, *(healpix.VARIANCE if names is healpix.HITS else healpix.HITS))
+    others = healpix.VARIANCE if names is healpix.HITS else (*healpix.HITS, *healpix.WEIGHT)
+    other = (*healpix.POLARISATION, *healpix.DEVIATION, *others)
     values, _, unit = healpix.read_map(path, tuple(names), moments.frame, alone=alone, other=other)
     _check_nside(values, path, moments)
     if names is healpix.HITS:

@@ -252,6 +252,12 @@ HITS = ("N_OBS", "HITS", "NOBS", "HIT", "NHITS")
 VARIANCE = ("II_COV", "VARIANCE", "I_VAR", "COV_II", "VAR_I", "VAR")
 """Names of columns with the variance of the temperature."""
 
+WEIGHT = ("WEIGHT", "WEIGHTS", "IVAR", "INV_VAR", "INVVAR", "INVERSE_VARIANCE", "I_IVAR", "II_IVAR")
+"""Names of columns with what grows as a variance falls."""
+
+DEVIATION = ("SIGMA", "SIGMA_I", "RMS", "STD", "STDDEV", "ERR", "ERROR", "I_ERR")
+"""Names of columns with standard deviations of the temperature."""
+
 PIXEL = ("PIXEL", "PIX", "IPIX")
 """Names of columns with the numbers of the pixels."""
 
@@ -330,7 +336,7 @@ def read_uk_and_unit(path: Path, frame: str, frequency_ghz: float | None) -> tup
     Raise InputError as :func:`read_map` does, if the header names a unit that cannot be converted, or if pixels are
     infinite.
     """
-    map_, _, unit = read_map(path, frame=frame, other=(*HITS, *VARIANCE, *POLARISATION))
+    map_, _, unit = read_map(path, frame=frame, other=(*HITS, *VARIANCE, *POLARISATION, *WEIGHT, *DEVIATION))
     check_not_infinite(map_, str(path))
     return np.where(map_ > UNSEEN_BELOW, to_uk(unit, path, frequency_ghz) * map_, map_), unit
 

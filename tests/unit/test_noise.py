@@ -292,6 +292,10 @@ def test_files_that_do_not_fit_are_refused(columns, keywords, named, tmp_path):
         ("variance", {"N_OBS": HITS}, {}, ("N_OBS", "II_COV")),
         ("hits", {"II_COV": VARIANCE}, {}, ("II_COV", "N_OBS")),
         ("hits", {"Q_STOKES": HITS}, {}, ("Q_STOKES", "N_OBS")),
+        ("variance", {"INV_VAR": 1.0 / VARIANCE}, {}, ("INV_VAR", "II_COV")),
+        ("variance", {"WEIGHT": 1.0 / VARIANCE}, {}, ("WEIGHT", "II_COV")),
+        ("variance", {"SIGMA": VARIANCE**0.5}, {}, ("SIGMA", "II_COV")),
+        ("hits", {"SIGMA": VARIANCE**0.5}, {}, ("SIGMA", "N_OBS")),
         ("hits", {"TEMPERATURE": HITS}, {"TEMPERATURE": "mK"}, ("mK", "observations")),
         ("hits", {"TEMPERATURE": HITS}, {"TEMPERATURE": "K_CMB^2"}, ("K_CMB^2", "observations")),
     ],
@@ -303,7 +307,7 @@ def test_a_lone_column_that_is_called_something_else_is_refused(noise, columns, 
         survey(run_with(given))
 
 
-@pytest.mark.parametrize("name", ["HITS", "II_COV", "Q_POLARISATION"])
+@pytest.mark.parametrize("name", ["HITS", "II_COV", "Q_POLARISATION", "INV_VAR", "SIGMA"])
 def test_what_is_no_temperature_is_no_map(name, tmp_path):
     path = Path(table(tmp_path / "bad.fits", {name: HITS}))
     with refused(path, name, "TEMPERATURE"):
