@@ -107,14 +107,22 @@ def test_its_contents_are_in_the_hash(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "header", ["l  W_l (beam squared)", "l W_{ell}", "l B_l^2", "window function squared", "l, w_l"]
+    "header", ["l  W_l (beam squared)", "l W_{ell}", "l B_l^2", "window function squared", "l, w_l", "window W(l)"]
 )
-def test_a_text_that_says_that_it_is_squared_is_refused(header, tmp_path):
+@pytest.mark.parametrize("comments", ["# ", "  # "])
+@pytest.mark.parametrize("name", ["wl.txt", "wl.txt.gz"])
+def test_a_text_that_says_that_it_is_squared_is_refused(header, comments, name, tmp_path):
     """It looks like B_l of a wider beam, and was taken for it."""
-    path = tmp_path / "wl.txt"
-    np.savetxt(path, np.stack([np.arange(LMAX + 1), WINDOW**2], axis=1), fmt=["%d", "%.17g"], header=header)
+    path, columns = tmp_path / name, np.stack([np.arange(LMAX + 1), WINDOW**2], axis=1)
+    np.savetxt(path, columns, fmt=["%d", "%.17g"], header=header, comments=comments)
     with refused(path, "W_l", "B_l"):
         read_window(path)
+
+
+def test_a_text_with_a_byte_order_mark_is_read(tmp_path):
+    path = tmp_path / "window.txt"
+    np.savetxt(path, WINDOW, header="B_l", encoding="utf-8-sig")
+    np.testing.assert_array_equal(read_window(path), WINDOW)
 
 
 def test_a_negative_degree_is_refused():

@@ -1,5 +1,6 @@
 """Beam windows B_l: text tables such as WMAP's, FITS tables such as Planck's, .npy files, arrays."""
 
+import gzip
 import re
 import warnings
 from pathlib import Path
@@ -25,9 +26,7 @@ DEGREES = ("L", "ELL", "MULTIPOLE")
 SQUARED = re.compile(r"(?i)^w_?(l|ell)$|^b_?(l|ell)_?\^?(2|sq|squared)$|_2_")
 """Names of columns of W_l = B_l^2; those of Planck's HFI have _2_ in them."""
 
-_SAID_SQUARED = re.compile(
-    r"(?i)(?<![a-z])(w_?\{?l(?![a-z])|w_\{?ell(?![a-z])|b_?\{?(l|ell)\}?\s*(\^|\*\*)\s*\{?2)|squared"
-)
+_SAID_SQUARED = re.compile(r"(?i)(?<![a-z])(w[_({]*(l|ell)(?![a-z])|b_?\{?(l|ell)\}?\s*(\^|\*\*)\s*\{?2)|squared")
 
 LARGEST = 1.05  #: of |B_l| over B_0: more is no beam
 
@@ -72,8 +71,10 @@ def _is_fits(path: Path) -> bool:
 def _of_text(path: Path) -> Window:
     with unreadable(path, "a table of B_l", "give columns ell and B_l"), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of an empty file, which is refused
-        table = np.loadtxt(path, ndmin=2)
-        comments = [line.strip() for line in path.read_text("utf-8", "replace").splitlines() if line.startswith("#")]
+        contents = path.read_bytes()
+        lines = (gzip.decompress(contents) if path.suffix == ".gz" else contents).decode("utf-8-sig", "replace")
+        table = np.loadtxt(lines.splitlines(), ndmin=2)
+        comments = [line.strip() for line in lines.splitlines() if line.lstrip().startswith("#")]
     said = next((line for line in comments if _SAID_SQUARED.search(line)), None)
     if said is not None and not re.search("(?i)ampl", " ".join(comments)):  # that of B_l may say what its square is
         raise InputError(f"{path} says {said[:60]!r}, so it seems to hold W_l = B_l^2; give the file of B_l.")
