@@ -23,7 +23,9 @@ _NAMES_OF_D_L = re.compile(
 _NAMES_OF_C_L = re.compile(r"(?i)(?<![a-z])C_?[\{(]?\\?(l|ell)(?=TT|[^a-z]|$)")
 
 _NAMES_OF_OTHERS = re.compile(r"(?i)(?<![a-z])(EE|BB|TE|ET|EB|TB|GRAD(IENT)?|CURL|[EGC]-[TEGC]|T-[EGC])(?![a-z])")
-_NAMES_OF_TEMPERATURE = re.compile(r"(?i)(?<![a-z])(TT|T-T|temperature|C_?l(?![a-z_]))(?![a-z])")
+_NAMES_OF_TEMPERATURE = re.compile(
+    r"(?i)(?<![a-z])(TT|T-T|temperature|C_?l(?![a-z_])(?![\W_]{0,3}(EE|BB|TE|ET|EB|TB)))(?![a-z])"
+)
 
 DEGREES = ("l", "ell", "multipole")  #: names of columns of ell in FITS tables
 

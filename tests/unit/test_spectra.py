@@ -196,6 +196,8 @@ def test_units_of_text_tables(tmp_path, header, factor):
         (1e-6 * D_L, "", ("D_l", "mK^2")),
         (LCDM, "l EE [uK^2]", ("EE", "TT")),
         (LCDM, "ell C_ell^TE", ("TE", "TT")),
+        (LCDM, "l C_l^{EE} [uK^2]", ("EE", "TT")),
+        (LCDM, "l C_l (TE)", ("TE", "TT")),
         (1e-12 * D_L, "", ("uK^2", "TUNIT1")),
         (LCDM, "l DlTT", ("D_l",)),
         (LCDM, "l D_l_TT", ("D_l",)),
