@@ -263,9 +263,9 @@ def damaged(path, change):
     table.writeto(path, overwrite=True)
 
 
-def drop(name):
+def drop(name, other=None):
     def change(table):
-        table.columns[name].name = f"NO_{name}"
+        table.columns[name].name = other or f"NO_{name}"
 
     return change
 
@@ -303,6 +303,7 @@ def header(key, value):
         (header("COORDSYS", None), {}, ("COORDSYS",)),
         (header("COORDSYS", "X"), {}, ("COORDSYS", "X")),
         (header("NSIDE", 32), {}, ("NSIDE", 32, "3072 pixels")),
+        (drop("DTHETA", "PIXEL"), {}, ("PIXEL",)),
         (header("NSIDE", 16), {"nside": 32}, ("nside 16", "nside 32")),
         (header("NSIDE", 16), {"frame": "galactic"}, ("galactic", "ecliptic")),
         (header("NSIDE", 16), {"frame": "lunar"}, ("frame", "lunar")),
@@ -425,7 +426,15 @@ def test_user_pointing_of_another_frame(tmp_path):
         Moments.from_pointing_files(path, NSIDE, 2, "ecliptic")
 
 
-@pytest.mark.parametrize("name", ["phi theta psi", "time theta phi psi", "theta[deg] phi[deg] psi[deg]", "DEGREES"])
+def test_the_south_pole_in_single_precision(tmp_path):
+    np.save(tmp_path / "p.npy", np.array([[np.pi, 0.1, 0.2]], dtype=np.float32))
+    assert Moments.from_pointing_files(tmp_path / "p.npy", NSIDE, 1).hits[-4:].sum() == 1.0
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["phi theta psi", "time theta phi psi", "theta[deg]", "DEGREES", "lat, lon, psi [rad]", "Dec, RA, psi"],
+)
 def test_user_pointing_whose_header_names_other_columns(tmp_path, name):
     np.savetxt(tmp_path / "p.txt", np.full((3, 3), 0.1), header=name)
     with refused("p.txt", "theta", "phi", "psi", name.replace(" ", ", ") if "theta " in name else name):

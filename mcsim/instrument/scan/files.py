@@ -16,6 +16,7 @@ from mcsim.instrument.scan.moments import Moments
 from mcsim.instrument.scan.offsets import HIGHEST, exponents
 from mcsim.sphere.checks import nside_of
 from mcsim.sphere.header import first_table, opened, radians, stated_frame
+from mcsim.sphere.healpix import PIXEL
 from mcsim.sphere.rotation import FRAMES
 from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npz
@@ -31,7 +32,8 @@ def read_moments(
 
     ``nside``, ``smax`` and ``frame`` are what the file must have; None: any, and all orders that follow each other from
     s = 1. Where a file has no COORDSYS, ``frame`` is taken for it. InputError if the file cannot be read, is NESTED,
-    lacks a column, has another nside or frame, negative hits, non-finite numbers, or a modulus above 1.
+    lacks a column, has pixel numbers out of order, another nside or frame, negative hits, non-finite numbers, or a
+    modulus above 1.
     """
     where = f"moments file {str(path)!r}"
     if frame is not None:
@@ -70,6 +72,9 @@ def _from_fits(path: str | Path, where: str, smax: int | None, frame: str | None
         raise InputError(f"{where} has no ORDERING; write RING there if its pixels are so, or reorder it first.")
     if str(header["ORDERING"]).strip().upper() != "RING":
         raise InputError(f"{where} has ORDERING = {header['ORDERING']!r}, but it must be RING; reorder it first.")
+    for name in set(PIXEL) & set(columns):
+        if not np.array_equal(columns[name], np.arange(hits.size)):
+            raise InputError(f"{where} has pixel numbers in {name} that do not count from 0; sort its rows by them.")
     stated = header["COORDSYS"] or frame
     if stated is None:
         raise InputError(f"{where} has no COORDSYS; write E, G or C there.")

@@ -22,6 +22,11 @@ from mcsim.support.folders import unreadable, user_path
 
 _ROWS = 1 << 20
 _NAMES = ("theta", "phi", "psi")
+_LATITUDE_AND_LONGITUDE = (
+    re.compile(r"(?i)\b(lat|latitude|dec|declination|el|elevation)\b"),
+    re.compile(r"(?i)\b(lon|longitude|ra|az|azimuth)\b"),
+)
+_LARGEST_COLATITUDE = float(np.float32(math.pi))  #: that of the south pole in single precision, 9e-8 above pi
 _ENOUGH_ROWS = 10  #: to tell a column of time from angles
 
 
@@ -89,7 +94,7 @@ def _columns(path: Path, frame: str) -> tuple[list[Any], list[float]]:
             return [table.data[name].ravel() for name in _NAMES], factors
     else:
         _check_header(path)
-        array = np.loadtxt(path, ndmin=2)
+        array = np.loadtxt(path, ndmin=2, encoding="utf-8-sig")
     if array.ndim != 2 or array.shape[1] not in (3, 4):
         raise ValueError(f"its shape is {array.shape}, not (n, 3) or (n, 4)")
     if array.shape[1] == 4 and len(array) >= _ENOUGH_ROWS and _rises(array[:, 0]) and not _rises(array[:, 3]):
@@ -99,9 +104,11 @@ def _columns(path: Path, frame: str) -> tuple[list[Any], list[float]]:
 
 def _check_header(path: Path) -> None:
     """Raise ValueError if the first lines of a text file name other columns or degrees."""
-    with path.open(encoding="utf-8") as stream:
-        for line in takewhile(lambda line: line.startswith("#"), stream):
+    with path.open(encoding="utf-8-sig") as stream:
+        for line in takewhile(lambda line: line.startswith("#"), map(str.lstrip, stream)):
             names = re.findall(r"theta|phi|psi|time", line.lower())
+            if not set(_NAMES) <= set(names) and all(word.search(line) for word in _LATITUDE_AND_LONGITUDE):
+                raise ValueError(f"it says {line.strip()[:60]!r}: give colatitude theta, phi and psi, in this order")
             if set(_NAMES) <= set(names) and tuple(names[:3]) != _NAMES:
                 raise ValueError(f"its columns are named {', '.join(names)}: give theta, phi, psi, time, in this order")
             if re.search(r"\bdeg|°", line.lower()):
@@ -119,7 +126,7 @@ def checked_samples(columns: Sequence[NDArray[np.float64]], where: str) -> tuple
         if not np.isfinite(column).all():
             raise InputError(f"{where}: {name} has values that are not finite; leave such samples out.")
     theta, phi, _ = columns
-    if theta.size and (theta.min() < 0.0 or theta.max() > math.pi):
+    if theta.size and (theta.min() < 0.0 or theta.max() > _LARGEST_COLATITUDE):
         exchanged = min(theta.min(), phi.min()) >= 0.0 and phi.max() <= math.pi and theta.max() <= 2.0 * math.pi
         remedy = "the columns theta and phi seem to be exchanged" if exchanged else "give colatitudes in radians"
         raise InputError(
