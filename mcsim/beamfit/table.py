@@ -248,6 +248,8 @@ def in_uk2(path: str | Path, table: Table, name: str) -> NDArray[np.float64]:
     if name not in table.colnames:
         raise InputError(f"{path} has no column {name}; add it.")
     column = table[name]
+    if column.dtype.kind == "c":
+        raise InputError(f"{path}: the column {name} is complex; give real parts, and imaginary ones as value_imag.")
     if column.unit is None:
         raise InputError(f"{path}: the column {name} has no unit; write uK2 (or mK2, K2) into its header.")
     try:

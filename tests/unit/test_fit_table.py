@@ -1,5 +1,7 @@
 """Tables of measured spectra: what they may leave open, and what they may not."""
 
+import warnings
+
 import numpy as np
 import pytest
 from astropy.table import Table
@@ -51,6 +53,13 @@ def test_the_header_says_where_the_maps_end(tmp_path):
     assert read(tmp_path, table(META | {"lmax": 40})).highest == 40
     with refused("lmax", "40.5"):
         read(tmp_path, table(META | {"lmax": 40.5}))
+
+
+def test_complex_values_are_refused(tmp_path):
+    made = table(value=[1.0 + 1.0j, 2.0, 3.0])
+    with warnings.catch_warnings(), refused("table.ecsv", "value", "value_imag"):
+        warnings.simplefilter("ignore")  # astropy's: the format has no complex numbers
+        read(tmp_path, made)
 
 
 def test_errors_of_few_realizations_are_no_known_errors(tmp_path):
