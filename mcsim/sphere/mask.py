@@ -44,7 +44,7 @@ def read_mask(
     mask_frame = mask_frame or stated or frame
     wrong = np.flatnonzero(~((mask >= 0.0) & (mask <= 1.0)))
     if wrong.size:
-        value = "UNSEEN" if mask[wrong[0]] == healpy.UNSEEN else f"{mask[wrong[0]]:g}"
+        value = "UNSEEN" if mask[wrong[0]] == healpy.UNSEEN else f"{mask[wrong[0]]:.9g}"
         raise InputError(
             f"{path} has values outside 0 ... 1 ({wrong.size} pixels, first {wrong[0]}: {value}); a mask is a map of "
             "weights, 1 where the sky is used and 0 where it is not."

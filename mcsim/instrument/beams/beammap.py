@@ -289,7 +289,8 @@ def _pixel_deg(header: fits.Header, path: str | Path) -> float:
     if not (step_x > 0 and abs(step_y - step_x) <= 1e-6 * step_x):
         raise InputError(
             f"{path} has steps of {step_x:g} and {step_y:g} deg (CDELT1, CDELT2), which must be equal and positive: "
-            "resample or flip the image so that columns follow the beam's x, or give pixel_deg"
+            "resample or flip the image so that columns follow the beam's x, or give pixel_deg if they do and pixels "
+            "are square"
         )
     for key in ("CROTA1", "CROTA2", "PC1_2", "PC2_1", "CD1_2", "CD2_1"):
         if header.get(key):
