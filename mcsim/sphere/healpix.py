@@ -300,7 +300,8 @@ def read_map(
             map_ = _in_ring_order(path, table, place, number)
             keywords, found = table.header, stated_frame(hdus, str(path))
             bad_data = keywords.get("BAD_DATA", hdus[0].header.get("BAD_DATA"))
-    unit = str(keywords.get(f"TUNIT{number + 1}", "")).strip() or None
+    stated = (f"TUNIT{number + 1}", *(() if names else ("BUNIT", "UNITS")))  # these are of temperatures
+    unit = next((word for key in stated if (word := str(keywords.get(key, "")).strip())), None)
     if str(keywords.get("TEMPTYPE", "")).strip().upper().startswith("ANT"):
         unit = f"{unit or 'K'} antenna"
     if frame is not None and found not in (None, frame):

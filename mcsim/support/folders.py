@@ -175,10 +175,10 @@ def filling(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def unreadable(name: str | Path, what: str, remedy: str) -> Iterator[None]:
-    """Turn whatever a library raises for a broken file into an InputError."""
+    """Turn whatever a library raises for a broken file into an InputError; a lack of memory is none of the file."""
     try:
         yield
-    except InputError:
+    except (InputError, MemoryError):
         raise
     except Exception as error:  # of any type
         raise InputError(f"{name} cannot be read as {what} ({error}); {remedy}.") from error

@@ -78,3 +78,21 @@ def test_a_table_of_other_pixels_than_its_header_says(tmp_path) -> None:
     path = written(tmp_path / "complex.fits", ("TEMPERATURE", "M", MAP + 1j, {}))
     with refused(path, "TEMPERATURE"):
         healpix.read_map(path)
+
+
+@pytest.mark.parametrize("keyword", ["BUNIT", "UNITS"])
+def test_a_unit_of_the_whole_table_is_that_of_temperatures(tmp_path, keyword: str) -> None:
+    columns = ("TEMPERATURE", "D", MAP, {}), ("N_OBS", "D", MAP, {})
+    path = written(tmp_path / "unit.fits", *columns, **{keyword: "mK"})
+    np.testing.assert_allclose(healpix.read_uk(path, "ecliptic", None), 1e3 * MAP)
+    assert healpix.read_map(path, healpix.HITS)[2] is None
+
+
+def test_a_lack_of_memory_is_not_a_broken_file(tmp_path, monkeypatch) -> None:
+    def lacking(*given: object) -> None:
+        raise MemoryError
+
+    path = written(tmp_path / "map.fits", ("TEMPERATURE", "D", MAP, {}))
+    monkeypatch.setattr(healpix, "_in_ring_order", lacking)
+    with pytest.raises(MemoryError):
+        healpix.read_map(path)
