@@ -24,6 +24,13 @@ from mcsim.support.arrays import Alm, Map, reals
 from mcsim.support.folders import unreadable
 from mcsim.support.loading import once_per_content
 
+ATTRIBUTES = {
+    "units": ("unit", "tunit", "bunit"),
+    "frame": ("coordsys", "coord"),
+    "ordering": ("order", "indexing_scheme"),
+}
+"""Attributes of given maps that are read, each with other names for it, in any case."""
+
 
 class Part(NamedTuple):
     """Name one map: as in a run (``W1:half1``), its channel and split, and what its unit and frame are read with."""
@@ -125,15 +132,19 @@ def in_uk(one: Any, name: str, frame: str, frequency_ghz: float | None) -> Map:
 
     Values that are not finite stay so: they do not say that a pixel was not observed, and diagnoses refuse them.
     ``name`` names it in messages. InputError for no array of numbers, or if its attributes ``frame`` or ``ordering``
-    say another frame or another order than RING.
+    say another frame or another order than RING. Their other usual names are read too (:data:`ATTRIBUTES`).
     """
-    said = getattr(one, "attrs", {})
+    given = getattr(one, "attrs", {}).items()
+    own = {str(key).strip().lower(): str(value) for key, value in given if value is not None}
+    if own.get("order", "").isdecimal():  # that of the resolution: 5 is nside 32
+        del own["order"]
+    said = {key: next((own[n] for n in (key, *names) if n in own), None) for key, names in ATTRIBUTES.items()}
     found = reals(one, name, healpy.UNSEEN)
-    factor = header.to_uk(said.get("units"), Path(name), frequency_ghz)
-    stated = header.frame_named(said.get("frame"), name, "frame")
+    factor = header.to_uk(said["units"], Path(name), frequency_ghz)
+    stated = header.frame_named(said["frame"], name, "frame")
     if stated not in (None, frame):
         raise InputError(f"{name} is in {stated} coordinates, but the model is {frame}; rotate it first.")
-    order = str(said.get("ordering", "RING")).strip().upper()
+    order = str(said["ordering"] or "RING").strip().upper()
     if order != "RING":
         raise InputError(f"{name} has ordering = {order!r}, but maps in memory and stores are RING; reorder it first.")
     return np.where((found > UNSEEN_BELOW) | ~np.isfinite(found), factor * found, healpy.UNSEEN)

@@ -54,10 +54,16 @@ def test_maps_of_another_frame_or_order_are_refused() -> None:
     """The stores of a run say both; a galactic ensemble was taken for an ecliptic one."""
     map_ = xr.DataArray(np.arange(12.0), dims="pixel", attrs={"units": "mK", "frame": "galactic", "ordering": "RING"})
     np.testing.assert_array_equal(in_order({"V": map_}, PARTS, "run.zarr")[0], 1000.0 * map_.values)
+    other = xr.DataArray(map_.values, dims="pixel", attrs={"Unit": "mK", "order": 0})
+    np.testing.assert_array_equal(in_order({"V": other}, PARTS, "run.zarr")[0], 1000.0 * map_.values)
+    map_ = map_.drop_attrs().assign_attrs(units="mK")
     for attribute, value, named in [
         ("frame", "ecliptic", ("run.zarr", "ecliptic", "galactic")),
         ("frame", "of the focal plane", ("run.zarr", "frame", "G")),
         ("ordering", "NESTED", ("run.zarr", "NESTED", "RING")),
+        ("COORDSYS", "E", ("run.zarr", "ecliptic", "galactic")),
+        ("indexing_scheme", "nested", ("run.zarr", "NESTED", "RING")),
+        ("order", "NESTED", ("run.zarr", "NESTED", "RING")),
     ]:
         with refused(*named):
             in_order({"V": map_.assign_attrs({attribute: value})}, PARTS, "run.zarr")
