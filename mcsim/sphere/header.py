@@ -62,13 +62,19 @@ def read_coefficients(path: Path, what: str) -> tuple[Alm, int, fits.Header]:
     """Return coefficients from a file of ``healpy.write_alm``, their mmax and header; InputError for any other file."""
     # A file with infinities is refused later, by name; joining real and imaginary parts would warn of them.
     with (
-        unreadable(path, what, "give FITS with the columns index, real, imaginary"),
+        unreadable(path, what, "give FITS with the columns index, real, imaginary, and a row for each l and m"),
         opened(path) as hdus,
         np.errstate(invalid="ignore"),
     ):
         table = first_table(hdus, 3)
         if str(table.header.get("PIXTYPE", "")).strip().upper() == "HEALPIX" or not len(table.data):
             raise ValueError("it is a map" if len(table.data) else "its table has no rows")
+        index = np.ravel(table.data.field(0)).astype(np.int64)
+        ell = np.floor(np.sqrt(np.maximum(index - 1, 0))).astype(np.int64)
+        lmax, mmax = int(ell.max()), int((index - ell * (ell + 1) - 1).max())
+        rows = healpy.Alm.getsize(lmax, mmax) if mmax >= 0 else 0
+        if np.unique(index).size < index.size or index.size != rows:  # healpy would put them in other places
+            raise ValueError(f"it has {index.size} rows, where every l up to {lmax} and m up to {mmax} make {rows}")
         packed, mmax = healpy.read_alm(table, return_mmax=True)
         table.header["COORDSYS"] = stated_frame(hdus, str(path)) or ""
         return packed, int(mmax), table.header

@@ -144,3 +144,17 @@ def test_orders_of_a_round_beam_are_no_polarised_one(lmax) -> None:
     own = Beam.gaussian(600.0, lmax)
     padded = np.concatenate([own.blm, np.zeros((2, lmax + 1))])
     np.testing.assert_allclose(Beam.from_blm(padded).blm[0], own.blm[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("rows", "named"),
+    [(slice(None, -7), (819, 826)), (slice(120, None), (706, 826)), (np.r_[0:826, 5], (827, 826))],
+)
+def test_a_file_that_lacks_rows_or_has_some_twice(tmp_path, beam, rows, named) -> None:
+    """Without the last seven coefficients it was read as of lmax = 119, every order above the first out of place."""
+    path = write(tmp_path / "beam.alm.fits", beam)
+    with fits.open(path) as hdus:
+        data = hdus[1].data[rows].copy()
+    fits.BinTableHDU(data).writeto(path, overwrite=True)
+    with refused(path, *named):
+        Beam.from_blm(path)
