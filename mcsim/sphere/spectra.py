@@ -122,7 +122,7 @@ def _read(spec: str | Path) -> tuple[NDArray[np.float64], str, bool]:
     path = resources.spectrum(spec)
     if path.suffix == ".npy":
         return read_npy(path, "iuf").astype(np.float64), "", False
-    if path.name.removesuffix(".gz").endswith((".fits", ".fit")):
+    if path.name.lower().removesuffix(".gz").endswith((".fits", ".fit")):
         return _read_fits(path)
     return _read_text(path)
 

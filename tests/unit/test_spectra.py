@@ -64,8 +64,9 @@ def test_compressed_text_table(tmp_path):
     np.testing.assert_array_equal(spectra.load(path, 4), CL)
 
 
-def test_fits_as_healpy_reads_it(tmp_path):
-    path = tmp_path / "cl.fits"
+@pytest.mark.parametrize("name", ["cl.fits", "CL.FITS"])
+def test_fits_as_healpy_reads_it(name, tmp_path):
+    path = tmp_path / name
     healpy.write_cl(path, [CL, CL / 50, CL / 500, CL / 9], dtype=np.float64)
     np.testing.assert_array_equal(spectra.load(path, 4), healpy.read_cl(path)[0])
 

@@ -79,7 +79,7 @@ def _columns(path: Path, frame: str) -> tuple[list[Any], list[float]]:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
         if array.dtype.names is not None:
             return [array[name] for name in _NAMES], factors
-    elif path.suffix in (".fits", ".fit", ".gz"):
+    elif path.suffix.lower() in (".fits", ".fit", ".gz"):
         from astropy.io import fits
 
         with fits.open(path) as hdus:
