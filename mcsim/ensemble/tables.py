@@ -20,6 +20,13 @@ from mcsim.support.folders import unreadable, unwritable, user_path, writable
 ENDINGS = (".zarr", ".nc", ".ecsv")  #: of files of summaries and predictions: Zarr, NetCDF, a table of bins
 TABLES = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}  #: astropy's formats of tables by ending
 
+DEFINITION = {
+    "scaling": "l(l+1)/2pi A, mean over ell_min <= l2 <= ell_max",
+    "normalisation": "Bennett (WMAP) for even parity; Hajian-Souradeep times (-1)^l2 ((2 l1 + 1)(2 l2 + 1))^(-1/4) for "
+    "odd parity",
+}
+"""What the header of a table of binned spectra says of its numbers."""
+
 
 def spectra(summary: xr.Dataset, kind: str) -> pd.DataFrame:
     """Return the bins of all spectra with L > 0: pair, mode, bin_first, bin_last, value and error in uK^2, sigma.
@@ -85,10 +92,7 @@ def table(summary: xr.Dataset) -> Table:
         result.meta["filter"] = "inverse_covariance"
     if "ell" in summary.sizes:
         result.meta["lmax"] = summary.sizes["ell"] - 1
-    result.meta["scaling"] = "l(l+1)/2pi A, mean over ell_min <= l2 <= ell_max"
-    result.meta["normalisation"] = (
-        "Bennett (WMAP) for even parity; Hajian-Souradeep times (-1)^l2 ((2 l1 + 1)(2 l2 + 1))^(-1/4) for odd parity"
-    )
+    result.meta |= DEFINITION
     return result
 
 
@@ -186,6 +190,13 @@ def _from_table(path: Path) -> xr.Dataset:
     from mcsim.bipolar import Mode  # the numerics, which load slowly
 
     table = Table.read(path, format="ascii.ecsv")
+    stated = DEFINITION | {"unit": "uK2"}
+    found = {key: str(table.meta.get(key)) for key in DEFINITION} | {"unit": str(table["value"].unit)}
+    for key in (one for one in stated if found[one] != stated[one]):
+        raise InputError(
+            f"{path} has {key} = {found[key]!r}, where a prediction has {stated[key]!r}; give what mcsim predict -o "
+            "wrote."
+        )
     rows = table.to_pandas().rename(columns={"ell_min": "bin_first", "ell_max": "bin_last"})
     modes = [Mode(*key) for key in zip(rows["L"], rows["M"], rows["d"], strict=True)]
     rows = rows.assign(mode=[mode.name for mode in modes], parity=[mode.parity for mode in modes])

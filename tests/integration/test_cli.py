@@ -443,3 +443,15 @@ def test_help_shows_no_type_of_flags_and_config_every_default(mcsim: Command) ->
         assert "bool" not in out
         assert "--help" in out
     assert json.loads(mcsim("config", "tiny")[1])["map"]["offset_order"] == 1
+
+
+@pytest.mark.parametrize(("stated", "other", "key"), [("uK2", "mK2", "unit"), ("Bennett", "Other", "normalisation")])
+def test_plot_draws_no_numbers_of_another_kind(
+    stated: str, other: str, key: str, mcsim: Command, tmp_path: Path
+) -> None:
+    (tmp_path / "small.toml").write_text(SMALL)
+    assert mcsim("predict", "small.toml", "-o", "expected.ecsv")[0] == 0
+    path = tmp_path / "expected.ecsv"
+    path.write_text(path.read_text().replace(stated, other))
+    with refused(path, key, stated):
+        tables.read_prediction(path)
