@@ -362,7 +362,10 @@ def _columns_of(
     if first is not None and ((len(maps) == 1 and alone) or not names) and columns[first] not in other:
         return place, first
     names = names or TEMPERATURE
-    raise InputError(f"{path} has the columns {', '.join(columns)} and none called {' or '.join(names)}; name it so.")
+    raise InputError(
+        f"{path} has the columns {', '.join(columns)} and none called {' or '.join(names)}; give that under such a "
+        "name."
+    )
 
 
 def _in_ring_order(path: Path, table: fits.BinTableHDU | fits.TableHDU, place: int | None, number: int) -> Map:
