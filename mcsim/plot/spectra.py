@@ -15,9 +15,14 @@ from matplotlib.patches import Patch
 from mcsim.ensemble import opening
 from mcsim.errors import InputError
 
-_COLOURS = ("#1f5fa8", "#c44e22", "#3c8c3c", "#7b4fa3", "#8c6d1f", "#1f8f94")
+# Okabe and Ito's palette: told apart with any colour vision. Markers tell more than six apart, and without colours.
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+_MARKERS = "os^Dv"
 
 _LEGEND: dict[str, Any] = {"fontsize": 8, "frameon": False}
+
+INSIDE = 4
+"""Lines up to which the legend of a single panel stands inside it."""
 
 SIGNAL, DWARFED = 5.0, 5.0
 """Errors from zero that make a signal of a point; height of axes, over that of the points, that hides it."""
@@ -60,8 +65,9 @@ def ensemble_figure(
             f"{path} has no mode with {asked or 'finite values'} of the pair {label}; mcsim info names what it holds."
         )
     expected = None if prediction is None else _matching(prediction, label, modes)
-    title = f"{Path(path).name}: {label.replace(',', ' × ')}, {int(modes['count'])} realizations"
-    return _draw(modes, title if caption else None, expected)
+    count, frame = int(modes["count"]), modes.attrs.get("frame")
+    title = f"{Path(path).name}: {label.replace(',', ' × ')}, {count} realization{'s' if count != 1 else ''}"
+    return _draw(modes, title + (f", {frame} frame" if frame else "") if caption else None, expected)
 
 
 def _matching(prediction: xr.Dataset, pair: str, modes: xr.Dataset) -> xr.Dataset:
@@ -82,47 +88,88 @@ def _matching(prediction: xr.Dataset, pair: str, modes: xr.Dataset) -> xr.Datase
 def _draw(modes: xr.Dataset, title: str | None, expected: xr.Dataset | None) -> Figure:
     """Draw a panel for each L and M; ``title`` None: neither title nor notes."""
     panels = sorted({(int(a), int(b)) for a, b in zip(modes["L"].values, modes["M"].values, strict=True)})
+    # The same d looks the same in every panel.
+    order = sorted({int(d) for d in modes["d"].values}, key=lambda d: (abs(d), d < 0))
+    looks = {d: (_COLOURS[k % len(_COLOURS)], _MARKERS[k % len(_MARKERS)]) for k, d in enumerate(order)}
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
-    size = (5.2 * columns, 3.6 * rows + 0.4) if len(panels) > 1 else (6.6, 4.6)
-    figure = Figure(figsize=size, layout="constrained")
     paired = "biposh_difference_binned_mean" in modes
+    bands = paired and any(M == 0 for _, M in panels) and int(modes["count"]) > 1
+    legend = _legend(modes, looks, bands, expected)
+    beside = len(panels) > 1 or len(legend) > INSIDE
+    size = (5.2 * columns, 3.6 * rows + 0.4) if len(panels) > 1 else (6.6, 4.6)
+    figure = Figure(figsize=(size[0] + 1.4 * beside, size[1]), layout="constrained")
     for number, (L, M) in enumerate(panels):
         axes = figure.add_subplot(rows, columns, number + 1)
         inside = (modes["L"].values == L) & (modes["M"].values == M)
-        for colour, index in zip(_COLOURS * 9, np.flatnonzero(inside), strict=False):
-            _spectrum(axes, modes.isel(mode=index), colour, paired)
+        for index in np.flatnonzero(inside):
+            look = looks[int(modes["d"].values[index])]
+            _spectrum(axes, modes.isel(mode=index), look, paired)
             if expected is not None:
-                _expected(axes, expected.isel(mode=index), colour, paired)
+                _expected(axes, expected.isel(mode=index), look[0], paired)
         if paired and M == 0:
             _frame(axes, modes.isel(mode=np.flatnonzero(inside)))
+        if modes.sizes["bin"] == 1:  # not a part of one degree
+            axes.set_xlim(float(modes["bin_first"][0]) - 0.5, float(modes["bin_last"][0]) + 0.5)
         axes.axhline(0.0, color="0.6", linewidth=0.8, zorder=0)
         if title is not None or len(panels) > 1:
             axes.set_title(f"L = {L}, M = {M}", fontsize=10)
         quantity = rf"$\ell(\ell+1)\hat{{A}}^{{{L}{M}}}/2\pi$  [$\mu$K$^2$]"
         axes.set(xlabel=r"multipole $\ell = \ell_2$", ylabel=quantity)
-        axes.legend(handles=[*axes.get_legend_handles_labels()[0], *_styles(paired and M == 0, expected)], **_LEGEND)
+    if beside:
+        figure.legend(handles=legend, loc="outside right upper", **_LEGEND)
+    else:
+        figure.axes[0].legend(handles=legend, **_LEGEND)
     if title is None:
         return figure
     figure.suptitle(title, fontsize=11, parse_math=False)
-    notes = [r"$\hat{A}$: Bennett normalisation (odd parity: Hajian-Souradeep, rescaled alike)"]
-    if paired:
-        notes += ["points: non-circular minus circular-beam control; bands may leave the panel"]
-    if expected is not None:
-        notes.append(f"prediction: {expected.attrs['prediction']}")
     # Some 15 letters of this size fill an inch: longer lines would be cut off at both ends.
-    figure.supxlabel(textwrap.fill(";  ".join(notes), round(14 * figure.get_figwidth())), fontsize=9)
+    notes = textwrap.fill(";  ".join(_notes(modes, bands, expected)), round(14 * figure.get_figwidth()))
+    figure.supxlabel(notes, fontsize=9)
     return figure
 
 
-def _styles(band: bool, expected: xr.Dataset | None) -> list[Artist]:
-    """Return what the legend says of bands and lines, whatever their colour."""
-    found: list[Artist] = []
-    if band:
-        found.append(Patch(color="0.5", alpha=0.3, linewidth=0, label="plain mean ± its error"))
+def _legend(
+    modes: xr.Dataset, looks: dict[int, tuple[str, str]], bands: bool, expected: xr.Dataset | None
+) -> list[Artist]:
+    """Return what the legend says: d by colour and marker, then parts, bands and lines, whatever their colour."""
+    found: list[Artist] = [
+        Line2D([], [], color=colour, marker=marker, markersize=4, linestyle="none", label=f"$d$ = {d}")
+        for d, (colour, marker) in looks.items()
+    ]
+    parts = {imaginary for k in range(modes.sizes["mode"]) for imaginary in _parts(modes.isel(mode=k))}
+    grey: dict[str, Any] = {"color": "0.3", "marker": "o", "markersize": 4, "linestyle": "none"}
+    if True in parts:
+        found += [Line2D([], [], label="filled: real part", **grey)] if False in parts else []
+        found.append(Line2D([], [], mfc="white", label="open: imaginary part", **grey))
+    if bands:
+        found.append(Patch(color="0.5", alpha=0.3, linewidth=0, label="without the control\ntaken off, ± 1σ"))
     if expected is not None:
-        found.append(Line2D([], [], color="0.3", linestyle="--", linewidth=1.0, label="prediction"))
+        line: dict[str, Any] = {"color": "0.3", "linewidth": 1.0}
+        real = "prediction" if True not in parts else "prediction, real"
+        found += [Line2D([], [], linestyle="--", label=real, **line)] if False in parts else []
+        if True in parts:
+            found.append(Line2D([], [], linestyle=":", label="prediction, imaginary", **line))
     return found
+
+
+def _notes(modes: xr.Dataset, bands: bool, expected: xr.Dataset | None) -> list[str]:
+    """Return the notes below the figure."""
+    count = int(modes["count"])
+    scatter = f"± 1σ of the mean of {count} realizations" if count > 1 else "one realization, without errors"
+    mean = "mean" if count > 1 else "value"
+    notes = [r"$\hat{A}$: Bennett normalisation (odd parity: Hajian-Souradeep, rescaled alike)", r"$d=\ell_2-\ell_1$"]
+    if "biposh_difference_binned_mean" in modes:
+        notes.append(f"points: {mean} of non-circular minus circular-beam control of the same skies, {scatter}")
+    else:
+        notes.append(f"points: {mean}, {scatter}")
+    if bands:
+        notes.append("bands: mean of the non-circular skies alone (M = 0), which may leave the panel")
+    if modes.sizes["mode"] > 1:
+        notes.append("points of a bin stand side by side")
+    if expected is not None:
+        notes.append(f"prediction: {expected.attrs['prediction']}")
+    return notes
 
 
 def _frame(axes: Axes, modes: xr.Dataset) -> None:
@@ -138,10 +185,11 @@ def _frame(axes: Axes, modes: xr.Dataset) -> None:
         axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
 
 
-def _abscissa(one: xr.Dataset) -> np.ndarray:
-    """Return the centres of the bins, with modes of one panel a tenth of a bin apart."""
-    width = one["bin_last"].values - one["bin_first"].values + 1.0
-    return np.asarray(one["bin"].values + 0.1 * width * int(one["d"]))
+def _abscissa(one: xr.Dataset, imaginary: bool = False) -> np.ndarray:
+    """Return the centres of the bins, with modes of one panel a tenth of a bin apart, and their two parts less."""
+    width = float(np.max(one["bin_last"].values - one["bin_first"].values)) + 1.0
+    part = 0.04 * (imaginary and int(one["M"]) > 0)
+    return np.asarray(one["bin"].values + width * (0.1 * int(one["d"]) + part))
 
 
 def _parts(one: xr.Dataset) -> list[bool]:
@@ -166,22 +214,27 @@ def _expected(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
     """Draw the prediction of one mode, a line for each part."""
     name = f"biposh{'_difference' if paired else ''}_binned_mean"
     for imaginary in _parts(one):
-        dashes = ":" if imaginary and int(one["M"]) > 0 else "--"
-        axes.plot(_abscissa(one), _component(one, name, imaginary), dashes, color=colour, linewidth=1.0)
+        x, values = _widened(_abscissa(one, imaginary), _component(one, name, imaginary))
+        axes.plot(x, values, ":" if imaginary else "--", color=colour, linewidth=1.0)
 
 
-def _spectrum(axes: Axes, one: xr.Dataset, colour: str, paired: bool) -> None:
+def _spectrum(axes: Axes, one: xr.Dataset, look: tuple[str, str], paired: bool) -> None:
     """Draw one mode: points with errors and, if paired, the band of the plain mean behind them."""
-    d, M, odd = int(one["d"]), int(one["M"]), str(one["parity"].values) == "odd"
-    name, x = f"biposh{'_difference' if paired else ''}_binned", _abscissa(one)
+    colour, marker = look
+    name = f"biposh{'_difference' if paired else ''}_binned"
     for imaginary in _parts(one):
-        label = f"d = {d}" + (f", {'imaginary' if imaginary else 'real'}" if M > 0 or odd else "")
-        filling, marker = "white" if imaginary and M > 0 else colour, "s" if imaginary else "o"
+        x, filling = _abscissa(one, imaginary), "white" if imaginary else colour
         values, error = _component(one, f"{name}_mean", imaginary), _error(one, name, imaginary)
-        axes.errorbar(
-            x, values, error, fmt=marker, ms=3.5, mfc=filling, color=colour, linewidth=1.0, capsize=2, label=label
-        )
-        if paired and M == 0:
-            middle = _component(one, "biposh_binned_mean", imaginary)
-            width = _error(one, "biposh_binned", imaginary)
+        axes.errorbar(x, values, error, fmt=marker, ms=3.5, mfc=filling, color=colour, linewidth=1.0, capsize=2)
+        if paired and int(one["M"]) == 0:
+            x, middle, width = _widened(
+                x, _component(one, "biposh_binned_mean", imaginary), _error(one, "biposh_binned", imaginary)
+            )
             axes.fill_between(x, middle - width, middle + width, color=colour, alpha=0.15, linewidth=0)
+
+
+def _widened(x: np.ndarray, *values: np.ndarray) -> list[np.ndarray]:
+    """Return places and values as they are, or a single place as a short stretch, so that a line or band shows."""
+    if len(x) > 1:
+        return [x, *values]
+    return [x[0] + np.array([-0.5, 0.5]), *(np.repeat(one, 2) for one in values)]
