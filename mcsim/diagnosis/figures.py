@@ -21,6 +21,7 @@ from mcsim.support.numbers import measured, p_equals
 
 # Okabe and Ito's palette: told apart with any colour vision.
 BLUE, RED, AMBER = "#0072b2", "#d55e00", "#e69f00"
+GREY, PALE = "#999999", "#dcdcdc"
 
 TOP, MAPS, LEAST = 15, 12, 1e-8
 """Candidates that are drawn, residual maps, and the p-value where the scale of controls ends."""
@@ -71,14 +72,26 @@ def candidates_figure(result: DiagnosisResult) -> Figure:
     axes = figure.subplots()
     accepted = [{result.candidates[k].label for k in one.candidates} for one in result.sets]
     named, others = (accepted[0] if accepted else set()), set().union(*accepted[1:])
-    colours = [BLUE if row.label in named else AMBER if row.label in others else "#b5b5b5" for row in rows]
+    level = result.settings.alpha
+    colours = [
+        BLUE if row.label in named else AMBER if row.label in others else GREY if row.pvalue < level else PALE
+        for row in rows
+    ]
     axes.barh(range(len(rows)), [row.significance for row in rows], height=0.7, color=colours)
+    beside: dict[str, Any] = {"xytext": (4, 0), "textcoords": "offset points", "va": "center", "fontsize": 7.5}
+    for place, row in enumerate(rows):
+        axes.annotate(p_equals(row.pvalue), (row.significance, place), **beside)
     axes.set_yticks(range(len(rows)), _labels([row.label for row in rows], WHOLE), fontsize=8)
     axes.set_ylim(len(rows) - 0.4, -0.6)
-    axes.set_xlim(0.0, None)
-    shown = [("blue: best set", BLUE), ("amber: an alternative", AMBER)]
+    axes.set_xlim(0.0, 1.17 * max([row.significance for row in rows], default=0.0) or 1.0)
+    shown = [
+        ("blue: best set", BLUE),
+        ("amber: an alternative", AMBER),
+        (f"pale: not significant, p ≥ {level:g}", PALE),
+    ]
     key = ", ".join(word for word, colour in shown if colour in colours)
-    axes.set_xlabel(r"fitted alone: $\sqrt{\Delta\chi^2}$" + (f"\n({key})" if key else ""), fontsize=9)
+    words = "fitted alone: $\\sqrt{\\Delta\\chi^2}$; p: look-elsewhere effect included"
+    axes.set_xlabel(words + (f"\n({key})" if key else ""), fontsize=9)
     _bare(axes)
     return figure
 
@@ -94,7 +107,9 @@ def blocks_figure(result: DiagnosisResult) -> Figure:
     at = np.array(
         [(kinds.index(e.family), names.index(column)) for e, column in zip(result.elements, columns, strict=True)]
     )
-    panels = {"before": result.z} | ({} if result.z_after is None else {"after the best fit": result.z_after})
+    panels = {"data less the model": result.z}
+    if result.z_after is not None:
+        panels = {"before": result.z, "after the best fit": result.z_after}
     rows = _labels(kinds, 80)
     # Beside the names of the rows panels of less than 1.6 inches would cut their titles and the words of the bar.
     width = 0.3 + 0.062 * max(map(len, rows)) + len(panels) * max(0.62 * len(names) + 0.3, 1.6)
@@ -108,7 +123,9 @@ def blocks_figure(result: DiagnosisResult) -> Figure:
         table[tuple(at[order].T)] = z[order]
         axes.set_facecolor("#e6e6e6")
         shown = axes.imshow(table, cmap="RdBu_r", vmin=-LIMIT, vmax=LIMIT, aspect="auto")
-        numbers = ((cell, f"{value:+.1f}") for cell, value in np.ndenumerate(table) if np.isfinite(value))
+        numbers = (
+            (cell, f"{value:+.1f}".replace("-", "−")) for cell, value in np.ndenumerate(table) if np.isfinite(value)
+        )
         write_cells(axes, numbers, np.abs(table) > 0.62 * LIMIT, 7)
         axes.set_xticks(range(len(names)), _labels(names, 22), rotation=45, ha="right", fontsize=8)
         axes.set_yticks(range(len(kinds)), rows, fontsize=8)
@@ -127,7 +144,8 @@ def elements_figure(result: DiagnosisResult) -> Figure:
     axes = figure.subplots()
     axes.axhspan(-2.0, 2.0, color="#e9e9e9", zorder=0)
     place = np.arange(len(order))
-    axes.plot(place, result.z[order], "o", markersize=3.2, color=RED, label="before")
+    first = "data less the model" if result.z_after is None else "before"
+    axes.plot(place, result.z[order], "o", markersize=3.2, color=RED, label=first)
     if result.z_after is not None:
         axes.plot(place, result.z_after[order], "o", markersize=3.2, color=BLUE, label="after the best fit")
     grey: dict[str, Any] = {"color": "0.6", "linewidth": 0.6}
@@ -278,6 +296,10 @@ def _matrix(result: DiagnosisResult, values: NDArray[np.float64], label: str, sc
             ticks[k].set(color=RED, fontweight="bold")
     extend = "neither" if "vmin" in scale else "both"
     bar = figure.colorbar(shown, ax=axes, location="top", aspect=30, extend=extend)
+    if "norm" in scale:
+        marks = [2, 3, 5, 10, 20, 50, 100]
+        bar.set_ticks(marks, labels=[str(mark) for mark in marks])
+        bar.ax.minorticks_off()
     bar.set_label(label, fontsize=9)
     return figure
 
