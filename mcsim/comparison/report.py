@@ -1,6 +1,8 @@
 """One self-contained page about a comparison: what differs, in maps, by degree and by hits."""
 
+import textwrap
 from pathlib import Path
+from typing import Any
 
 import healpy
 import numpy as np
@@ -17,7 +19,17 @@ from mcsim.support.numbers import number
 
 DOTS_PER_INCH = 110
 SHOWN = 64  #: nside of the maps in pictures
-_TICKS = (2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  #: multipoles that an axis names
+_TICKS = [digit * 10**power for power in range(9) for digit in (1, 2, 5)]  #: multipoles or samples that an axis names
+_LETTERS = 40  #: of a line of the words beside the maps
+_LEGEND: dict[str, Any] = {
+    "frameon": False,
+    "fontsize": 9,
+    "ncols": 4,
+    "loc": "lower right",
+    "bbox_to_anchor": (1.0, 1.0),
+    "borderaxespad": 0.2,
+}  # above the panel: lines go everywhere
+_ROUNDED = 1e-20  #: power over the largest of side A below which it is that of rounding errors
 
 
 def page(result: ComparisonResult) -> str:
@@ -38,14 +50,14 @@ def figure(channel: ChannelResult) -> Figure:
     first = _first(channel)
     a, b, explained, seen = (one[first] for one in (channel.a, channel.b, channel.explained, channel.seen))
     difference = b - a
-    for key, title, values in (
-        ("a", f"A: {channel.splits[first]}", a),
-        ("b", "B", b),
-        ("c", "B − A", difference),
-        ("d", "explained", explained),
-        ("e", "left", difference - explained),
+    for key, title, values, signed in (
+        ("a", f"A: {channel.splits[first].replace(':', ' ')}", a, False),
+        ("b", "B", b, False),
+        ("c", "B − A", difference, True),
+        ("d", "explained", explained, True),
+        ("e", "left", difference - explained, True),
     ):
-        _draw_map(axes[key], np.where(seen, values, np.nan), title)
+        _draw_map(axes[key], np.where(seen, values, np.nan), title, signed)
     _draw_words(axes["f"], channel)
     _draw_spectra(axes["g"], channel)
     _draw_depth(axes["h"], channel)
@@ -57,22 +69,31 @@ def _first(channel: ChannelResult) -> int:
     return int(np.argmax(channel.seen.any(axis=1)))
 
 
-def _draw_map(axes: Axes, values: NDArray[np.float64], title: str) -> None:
-    """Draw a Mollweide view, its colours up to the 99.5th percentile of |value|."""
+def _draw_map(axes: Axes, values: NDArray[np.float64], title: str, signed: bool) -> None:
+    """Draw a Mollweide view, its colours up to the 99.5th percentile of |value|: about zero if ``signed``, or the mean.
+
+    The rms of a ``signed`` map, a difference, has its mean in it, as in the words of the page.
+    """
     nside = min(SHOWN, healpy.npix2nside(values.size))
     coarse = healpy.ud_grade(np.where(np.isfinite(values), values, healpy.UNSEEN), nside)
     coarse = np.where(coarse == healpy.UNSEEN, np.nan, coarse)
-    middle = float(np.nanmean(values))
+    mean = float(np.nanmean(values))
+    middle = 0.0 if signed else mean
+    rms = float(np.sqrt(np.nanmean((values - middle) ** 2)))
+    words = (
+        f"rms {number(rms)} µK" if abs(middle) < 0.1 * rms else f"mean {number(mean)}, rms about it {number(rms)} µK"
+    )
     largest = float(np.nanquantile(np.abs(values - middle), 0.995)) or 1.0
     shown = mollweide(axes, coarse, 500, cmap="RdBu_r", vmin=middle - largest, vmax=middle + largest)
-    axes.set_title(f"{title}: rms {number(float(np.nanstd(values)))} µK", fontsize=10, parse_math=False)
+    axes.set_title(f"{title}: {words}", fontsize=10, parse_math=False)
     axes.figure.colorbar(
         shown, ax=axes, orientation="horizontal", shrink=0.7, aspect=30, pad=0.02, ticks=MaxNLocator(4)
     ).set_label("µK")
 
 
-def _plain_ticks(axes: Axes) -> None:
-    """Write the ticks of a logarithmic x axis as numbers, and no others."""
+def _plain_ticks(axes: Axes, low: float, high: float) -> None:
+    """Write few round numbers at a logarithmic x axis that spans these values, and no others."""
+    axes.set_xticks([tick for tick in _TICKS if low <= tick <= high] or [low, high])
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
     axes.xaxis.set_minor_locator(NullLocator())
 
@@ -84,7 +105,8 @@ def _draw_words(axes: Axes, channel: ChannelResult) -> None:
               for key, value in d.parameters.items()]  # fmt: skip
     axes.axis("off")
     lines += ["or " + " and ".join(d.words for d in one) for one in channel.alternatives]
-    text = "\n".join([channel.verdict, *lines])
+    wrapped = [textwrap.fill(line, _LETTERS, subsequent_indent="    ") for line in lines]
+    text = "\n".join([channel.verdict, *wrapped])
     axes.text(0.05, 0.9, text, va="top", fontsize=11, linespacing=1.5, transform=axes.transAxes, parse_math=False)
 
 
@@ -92,7 +114,7 @@ def _draw_spectra(axes: Axes, channel: ChannelResult) -> None:
     """Draw power by degree: side A, the difference, what is explained, and what is left."""
     nside = healpy.npix2nside(channel.a.shape[1])
     first, lmax = _first(channel), 2 * nside
-    ell = np.arange(2, lmax + 1)
+    ell, floor = np.arange(2, lmax + 1), 0.0
     difference = channel.b - channel.a
     for label, values, colour, style in (
         ("A", channel.a, "#444444", "-"),
@@ -104,10 +126,15 @@ def _draw_spectra(axes: Axes, channel: ChannelResult) -> None:
         power = healpy.alm2cl(alm)[2:]
         if power.max() > 0.0:
             axes.loglog(ell, ell * (ell + 1) / (2.0 * np.pi) * power, label=label, color=colour, ls=style, lw=1.2)
-    axes.set_xticks([tick for tick in _TICKS if 2 <= tick <= lmax])
-    _plain_ticks(axes)
-    axes.set(xlabel="multipole $\\ell$", ylabel="$\\ell(\\ell + 1) C_\\ell / 2\\pi$  [µK²]", title="by degree")
-    axes.legend(frameon=False, fontsize=9)
+        if label == "A" and axes.lines:
+            floor = _ROUNDED * float(np.max(axes.lines[0].get_ydata()))
+    bottom, top = axes.get_ylim()
+    if bottom < floor < top:
+        axes.set_ylim(floor, top)
+    _plain_ticks(axes, 2, lmax)
+    axes.set(xlabel="multipole $\\ell$", ylabel="$\\ell(\\ell + 1) C_\\ell / 2\\pi$  [µK²]")
+    axes.set_title("by degree", loc="left")
+    axes.legend(**_LEGEND)
 
 
 def _draw_depth(axes: Axes, channel: ChannelResult) -> None:
@@ -130,7 +157,7 @@ def _draw_depth(axes: Axes, channel: ChannelResult) -> None:
         axes.text(0.5, 0.5, "no difference", ha="center", va="center", transform=axes.transAxes)
         axes.axis("off")
         return
-    axes.set_xticks([*middle[:: max(1, (middle.size - 1) // 3)]])
-    _plain_ticks(axes)
-    axes.set(xlabel="samples in a pixel", ylabel="rms  [µK]", title="by hits")
-    axes.legend(frameon=False, fontsize=9)
+    _plain_ticks(axes, float(middle.min()), float(middle.max()))
+    axes.set(xlabel="samples in a pixel", ylabel="rms  [µK]")
+    axes.set_title("by hits", loc="left")
+    axes.legend(**_LEGEND)
