@@ -1,5 +1,6 @@
 """Figure of a scan: orientation of the beam and <cos 2 psi> over the sky, hits and w_2 by latitude."""
 
+import healpy
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -32,11 +33,20 @@ def scan_figure(moments: Moments, title: str = "", model: ScanModel | None = Non
     seen = np.asarray(moments.hits > 0.0)
     w2 = np.where(seen, moments.w[1], np.nan)
     figure = Figure(figsize=(11.0, 7.0), layout="constrained")
-    figure.suptitle(title, parse_math=False)
+    nside = healpy.npix2nside(seen.size)
+    named = f"{title}: " if title else ""
+    where = f"{named}{moments.frame} frame, nside {nside}; Mollweide, longitude 0 in the middle, growing to the left"
+    figure.suptitle(where, fontsize=11, parse_math=False)
     axes = figure.subplots(2, 2, height_ratios=(1.0, 0.8))
-    _panel(axes[0, 0], np.degrees(-0.5 * np.angle(w2)), "twilight_shifted", 90.0, "degrees, modulo 180")
+    _panel(
+        axes[0, 0],
+        np.degrees(-0.5 * np.angle(w2)),
+        "twilight_shifted",
+        90.0,
+        "degrees from $e_\\theta$ (south) towards $e_\\phi$ (east), modulo 180",
+    )
     axes[0, 0].set_title(r"mean orientation $\bar\psi = -\frac{1}{2}\,\arg w_2$")
-    _panel(axes[0, 1], w2.real, "RdBu", 1.0, "")
+    _panel(axes[0, 1], w2.real, "RdBu", 1.0, "1: along the meridian; −1: across")
     axes[0, 1].set_title(r"$\langle\cos 2\psi\rangle = \mathrm{Re}\,w_2$")
     _against_latitude(axes[1, 0], axes[1, 1], moments, model)
     return figure
@@ -44,8 +54,9 @@ def scan_figure(moments: Moments, title: str = "", model: ScanModel | None = Non
 
 def _panel(axes: Axes, values: NDArray[np.float64], colours: str, limit: float, unit: str) -> None:
     """Draw a map with a colour bar that is symmetric about zero."""
+    ticks = limit * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
     shown = mollweide(axes, values, 1200, cmap=colours, vmin=-limit, vmax=limit)
-    axes.figure.colorbar(shown, ax=axes, orientation="horizontal", shrink=0.6, pad=0.02, label=unit)
+    axes.figure.colorbar(shown, ax=axes, orientation="horizontal", shrink=0.6, pad=0.02, label=unit, ticks=ticks)
 
 
 def _against_latitude(hits_axes: Axes, w_axes: Axes, moments: Moments, model: ScanModel | None) -> None:
