@@ -251,9 +251,13 @@ def controls_figure(result: DiagnosisResult, controls: Controls) -> Figure:
     axes.plot(expected, p, "o", color=BLUE, markersize=5, label="controls")
     data = f"data, {p_equals(result.test.pvalue)}" + " (off the scale)" * (result.test.pvalue < LEAST)
     axes.axhline(max(result.test.pvalue, LEAST), color=RED, linewidth=1.4, label=data)
-    axes.axhline(controls.alpha, color="black", linewidth=0.8, linestyle="--")
+    level = f"different at {100.0 * controls.alpha:g} %"
+    axes.axhline(controls.alpha, color="black", linewidth=0.8, linestyle="--", label=level)
     axes.set(xscale="log", yscale="log", xlabel="expected p-value of this rank", ylabel="global p-value")
-    axes.legend(frameon=False, fontsize=8, loc="lower right")
+    ticks = [tick for tick in (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0) if tick >= expected[0] / 2.0]
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+    figure.legend(frameon=False, fontsize=8, loc="outside upper center", ncols=3)
     _bare(axes)
     return figure
 

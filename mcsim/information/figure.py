@@ -26,8 +26,8 @@ def limit_figure(found: Limits) -> Figure:
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.0))
     rows = np.arange(count)
     for key, colour, text in (
-        ("amplitude_90", AMBER, "detected among all effects"),
-        ("amplitude_90_known", BLUE, "detected if alone tested"),
+        ("amplitude_90", AMBER, "detected among all effects (90 %)"),
+        ("amplitude_90_known", BLUE, "detected if alone tested (90 %)"),
         ("sigma", GREY, "sigma"),
     ):
         ratio = [getattr(one, key) / one.sigma if np.isfinite(one.sigma) else 0.0 for one in effects]
@@ -36,7 +36,7 @@ def limit_figure(found: Limits) -> Figure:
     inside, beyond = apart < REACH, apart >= REACH  # neither without another effect
     starred = np.array([one.amplitude("separable").endswith("*") for one in effects])
     style: dict[str, Any] = {"markersize": 9, "markeredgewidth": 1.6, "linestyle": "none", "color": "black"}
-    left.plot(apart[inside], rows[inside], marker="|", label="told apart from the most similar", **style)
+    left.plot(apart[inside], rows[inside], marker="|", label="told apart from the most similar (95 %)", **style)
     left.plot(
         [0.97 * REACH] * int(np.sum(beyond)), rows[beyond], marker="$>$", label="that lies farther right", **style
     )
@@ -44,7 +44,7 @@ def limit_figure(found: Limits) -> Figure:
     _hatch_impossible(left, found)
     beside: dict[str, Any] = {"va": "center", "fontsize": 7, "parse_math": False}
     for row, one in enumerate(effects):
-        unit = "" if one.unit.startswith("1") else f" ({one.unit})"
+        unit = "" if one.unit.startswith("1") else f" ({one.unit})".replace("uK", "µK").replace("^2", "²")
         shown = f"{number(one.sigma)} | {one.amplitude('amplitude_90')}{unit}"
         left.annotate(shown, (1.0, row), (4, 0), ("axes fraction", "data"), "offset points", **beside)
     left.set_yticks(rows, [one.title for one in effects], fontsize=8, parse_math=False)
