@@ -348,7 +348,8 @@ class DirectedEffect(Effect):
 
     def direction(self) -> str:
         """Return longitude and latitude in the frame of the maps."""
-        return f"towards longitude {self.lon_deg:.0f}°, latitude {self.lat_deg:.0f}°".replace("-", "−")
+        lon, lat = round(self.lon_deg) % 360, round(self.lat_deg)  # neither 360 degrees nor -0
+        return f"towards longitude {lon}°, latitude {lat}°".replace("-", "−")
 
 
 def described(effect: Effect, frame: str, sigma: float = 0.0, errors: Mapping[str, float] | None = None) -> str:
