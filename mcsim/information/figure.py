@@ -26,8 +26,8 @@ def limit_figure(found: Limits) -> Figure:
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.0))
     rows = np.arange(count)
     for key, colour, text in (
-        ("amplitude_90", AMBER, "detected among all effects (90 %)"),
-        ("amplitude_90_known", BLUE, "detected if alone tested (90 %)"),
+        ("amplitude_90", AMBER, "detected among all effects"),
+        ("amplitude_90_known", BLUE, "detected if alone tested"),
         ("sigma", GREY, "sigma"),
     ):
         ratio = [getattr(one, key) / one.sigma if np.isfinite(one.sigma) else 0.0 for one in effects]
@@ -36,7 +36,7 @@ def limit_figure(found: Limits) -> Figure:
     inside, beyond = apart < REACH, apart >= REACH  # neither without another effect
     starred = np.array([one.amplitude("separable").endswith("*") for one in effects])
     style: dict[str, Any] = {"markersize": 9, "markeredgewidth": 1.6, "linestyle": "none", "color": "black"}
-    left.plot(apart[inside], rows[inside], marker="|", label="told apart from the most similar (95 %)", **style)
+    left.plot(apart[inside], rows[inside], marker="|", label="told apart from the most similar", **style)
     left.plot(
         [0.97 * REACH] * int(np.sum(beyond)), rows[beyond], marker="$>$", label="that lies farther right", **style
     )
@@ -50,7 +50,13 @@ def limit_figure(found: Limits) -> Figure:
     left.set_yticks(rows, [one.title for one in effects], fontsize=8, parse_math=False)
     left.set_ylim(count - 0.4, -0.6)
     left.set_xlim(0.0, REACH)
-    left.set_xlabel("amplitude / sigma;  at the right: sigma | detected among all", fontsize=9)
+    of = found.settings
+    left.set_xlabel(
+        "amplitude / sigma;  at the right: sigma | detected among all\n"
+        f"detected: {100 * of.power:g} % power at a level of {100 * of.alpha:g} %;  "
+        f"told apart: right in {100 * of.separation:g} %",
+        fontsize=9,
+    )
     left.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
     shades = ListedColormap(["#ffffff", "#dbe9f4", "#a6cbe3", "#5fa2cf", "#e69f00", "#b04a00"])
     levels = [0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0]

@@ -113,5 +113,6 @@ def _draw_blm(axes: Axes, beam: Beam) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_ylabel(r"$|b_{\ell m}|\,\sqrt{4\pi/(2\ell+1)}$   ($m=0$: $|B_\ell|$)")
     beyond = f"; {beam.neglected_power:.1e} of the power beyond" if beam.neglected_power > 0 else ""
-    axes.set_title(f"Coefficients, m ≤ {beam.mmax}{beyond}", fontsize=10)
+    orders = f"m ≤ {beam.mmax}" if beam.mmax else "m = 0 alone"
+    axes.set_title(f"Coefficients, {orders}{beyond}", fontsize=10)
     axes.legend(title="m", fontsize=8, ncols=3, loc="best", framealpha=0.9)

@@ -94,7 +94,7 @@ def test_text_names_what_matters() -> None:
         "+20.0 deg",
         "|b_l2/b_l0|",
         "beyond mmax",
-        "negative response    0 of",
+        "negative response    none",
     ):
         assert fragment in text
     assert "note" not in text

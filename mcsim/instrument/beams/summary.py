@@ -120,15 +120,18 @@ def format_summary(summary: BeamSummary) -> str:
     # Adding 0.0 turns a rounded -0.0 into 0.0.
     x, y = (round(offset, 3) + 0.0 for offset in summary.centroid_arcmin)
     beam, last = summary.beam, summary.beam.window[-1]
+    square, share = summary.solid_angle_sr * _ARCMIN**2, summary.negative_over_positive
+    negative = f"{share:.2g} of the positive" if share > _ROUNDED else "none"
+    beyond = f": {beam.neglected_power:.1e} of the power beyond mmax" if beam.neglected_power > 0 else ""
     lines = [
-        f"solid angle          {summary.solid_angle_sr:.4e} sr = {summary.solid_angle_sr * _ARCMIN**2:.2f} arcmin^2",
+        f"solid angle          {summary.solid_angle_sr:.4e} sr = {square:.{0 if square >= 1e4 else 2}f} arcmin^2",
         f"FWHM, circular part  {summary.fwhm_circular_arcmin:.2f} arcmin",
         f"FWHM, major x minor  {summary.fwhm_major_arcmin:.2f} x {summary.fwhm_minor_arcmin:.2f} arcmin",
         f"axis ratio           {summary.axis_ratio:.4f}, {orientation}",
         f"mean offset          ({x:+.3f}, {y:+.3f}) arcmin in (x, y)",
-        f"negative response    {summary.negative_over_positive:.2g} of the positive",
+        f"negative response    {negative}",
         f"integral             {beam.integral:.6g} (unit of the source x sr), divided out so that B_0 = 1",
-        f"lmax, mmax           {beam.lmax}, {beam.mmax}: {beam.neglected_power:.1e} of the power beyond mmax",
+        f"lmax, mmax           {beam.lmax}, {beam.mmax}{beyond}",
     ]
     if summary.source == "blm" and abs(last) > BAND_LIMITED_WINDOW:
         lines.append(
@@ -145,13 +148,14 @@ def format_summary(summary: BeamSummary) -> str:
     lines += ["", "     l          B_l" + "".join(f"{f'|b_l{m}/b_l0|':>14}" for m in orders)]
     for i, ell in enumerate(summary.ells):
         if abs(window[i]) < _LISTED_WINDOW and i > 1:
-            lines.append(f"     B_l is below {_LISTED_WINDOW:g} from there on")
+            lines.append(f"{ell:6d}  |B_l| is below {_LISTED_WINDOW:g} here and beyond")
             break
         ratios = "".join(f"{table[m, i]:14.3e}" for m in orders)
         lines.append(f"{ell:6d} {window[i]:12.6f}{ratios}")
     return "\n".join(lines)
 
 
+_ROUNDED = 1e-9  #: negative response over the positive that is a rounding error
 _LISTED_WINDOW = 1e-9  #: smallest B_l that is listed: ratios to smaller ones are noise
 
 _Response = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
