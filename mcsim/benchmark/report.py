@@ -62,8 +62,8 @@ def write(score: Score, folder: Path) -> None:
 
 
 def lines(score: Score) -> list[str]:
-    """Return the metrics for a terminal, those that miss their target first."""
-    return [
+    """Return a head and the metrics for a terminal, those that miss their target first."""
+    return ["       figure: value [95 % interval] of so many cases; target"] + [
         f"{_mark(one):<6} {one.name}: {_value(one)}{f' [{_interval(one)}]' if _interval(one) else ''} of {one.count}"
         + (f"; target: {one.target}" if one.target else "")
         for one in _ordered(score)
@@ -116,11 +116,14 @@ def score_figure(score: Score, answers: Confusion, bayes: Confusion) -> Figure:
     classifier; the confusion matrices of both.
     """
     figure = Figure(figsize=(15.0, 16.0), layout="constrained")
-    figure.suptitle(score.title, fontsize=13, parse_math=False)
+    words = "bars of fractions: 95 % intervals; bars of reductions: ± 1σ; shades of the tables: share of the row"
+    figure.suptitle(f"{score.title}\n{words}", fontsize=11, parse_math=False)
     upper, lower = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 1.05)), dtype=object))
     panels = (_calibration, _power, _unknown, _pulls, _reduction, _right)
     for axes, panel in zip(upper.subplots(2, 3).flat, panels, strict=True):
         panel(axes, score)
+        if panel in (_power, _unknown, _right):
+            axes.set_xlim(left=0.0)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize=8, framealpha=0.8, edgecolor="none")
     left, right = lower.subplots(1, 2, width_ratios=[max(len(matrix.answers), 1) for matrix in (answers, bayes)])
@@ -166,7 +169,7 @@ def _power(axes: Axes, score: Score) -> None:
         s = np.array([record.strength for record in ones])
         _binned(axes, s, [record.maximum <= ALPHA for record in ones], "largest matched filter")
         _binned(axes, 1.01 * s, [record.p_value <= ALPHA for record in ones], "global test", RED)
-    axes.axhline(0.9, color=GREY, linewidth=0.6, linestyle=":")
+    axes.axhline(0.9, color=GREY, linewidth=0.6, linestyle=":", label="90 %")
     axes.set(xlabel="Expected S/N", ylabel="Fraction detected at 5 %", title="Single effects", ylim=SHARE)
 
 
@@ -175,7 +178,7 @@ def _unknown(axes: Axes, score: Score) -> None:
     beyond = [record.distances[-1] for record in rows]
     _binned(axes, beyond, [record.verdict == "unknown" for record in rows], "called unknown", BLUE, 6)
     _binned(axes, beyond, [record.wrong_name for record in rows], "wrong single name", RED, 6)
-    axes.axvline(FAR, color=GREY, linewidth=0.6, linestyle=":")
+    axes.axvline(FAR, color=GREY, linewidth=0.6, linestyle=":", label=f"S/N {FAR:g}: targets are for those beyond")
     axes.set(xlabel="Expected S/N beyond every three effects of the library", ylabel="Fraction of cases")
     axes.set(title="Effects that the library does not have", ylim=SHARE)
 
