@@ -143,7 +143,7 @@ def _legend(
         found += [Line2D([], [], label="filled: real part", **grey)] if False in parts else []
         found.append(Line2D([], [], mfc="white", label="open: imaginary part", **grey))
     if bands:
-        found.append(Patch(color="0.5", alpha=0.3, linewidth=0, label="without the control\ntaken off, ± 1σ"))
+        found.append(Patch(color="0.5", alpha=0.3, linewidth=0, label="plain mean ± 1σ\n(no control taken off)"))
     if expected is not None:
         line: dict[str, Any] = {"color": "0.3", "linewidth": 1.0}
         real = "prediction" if True not in parts else "prediction, real"
@@ -164,7 +164,7 @@ def _notes(modes: xr.Dataset, bands: bool, expected: xr.Dataset | None) -> list[
     else:
         notes.append(f"points: {mean}, {scatter}")
     if bands:
-        notes.append("bands: mean of the non-circular skies alone (M = 0), which may leave the panel")
+        notes.append("bands: plain mean, of the non-circular skies alone (M = 0); they may leave the panel")
     if modes.sizes["mode"] > 1:
         notes.append("points of a bin stand side by side")
     if expected is not None:
