@@ -22,6 +22,7 @@ LARGE = 12  #: highest degree of the largest scales
 SPARE, SPARE_SHRUNK = 2.0, 1.25  #: simulations per element that a comparison needs; with a shrunk covariance
 FOLDS = {
     "noise": ("even pixels", "odd pixels"),
+    "fine": ("even pixels", "odd pixels"),
     "sky": ("even degrees", "odd degrees"),
     "isotropy": ("lower degrees", "higher degrees"),
 }

@@ -167,8 +167,10 @@ def held_out(result: DiagnosisResult) -> str:
             "Not measured: a half of the data hardly measures the effects, or asks for what they cannot be, or the "
             "held-out one shows no excess χ² by itself."
         )
-    start, forecast = "Adding the best fit to the simulator removes", f"; {percent(found.predicted)} was predicted"
-    return _removed(found, start, forecast)
+    forecast = f"; {percent(found.predicted)} was predicted"
+    if found.predicted.sigma >= LARGEST_ERROR:
+        forecast = "; what was predicted is too uncertain to quote"
+    return _removed(found, "Adding the best fit to the simulator removes", forecast)
 
 
 def _removed(found: HeldOut, start: str, forecast: str = "") -> str:

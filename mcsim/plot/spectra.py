@@ -66,7 +66,8 @@ def ensemble_figure(
         )
     expected = None if prediction is None else _matching(prediction, label, modes)
     count, frame = int(modes["count"]), modes.attrs.get("frame")
-    title = f"{Path(path).name}: {label.replace(',', ' × ')}, {count} realization{'s' if count != 1 else ''}"
+    which = f" (of {len(pairs)} pairs)" if len(pairs) > 1 else ""
+    title = f"{Path(path).name}: {label.replace(',', ' × ')}{which}, {count} realization{'s' if count != 1 else ''}"
     return _draw(modes, title + (f", {frame} frame" if frame else "") if caption else None, expected)
 
 

@@ -18,6 +18,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.shared_sky import shared_sky
 from mcsim.datavector.summaries import blocks_of
 from mcsim.datavector.wiener_filter import wiener_filter
+from mcsim.diagnosis.consistency import FOLDS
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
@@ -231,6 +232,8 @@ def test_the_power_of_the_sky_beyond_the_filter_is_measured(bright):
     fine = [place for place, one in enumerate(elements) if one.kind == "fine"]
     assert len(fine) == 2 * (len(bright.settings.latitude_edges) - 1)
     assert {elements[place].ell for place in fine} == {(bright.lmax + 1, made.config.sky.lmax)}
+    # All splits have it in common: the report may not name one of them.
+    assert {one.kind for one in elements if one.fold is not None and one.split is None} <= FOLDS.keys()
     weaker = np.where(np.arange(made.cl.size) > bright.lmax, 0.8, 1.0)
     power = np.zeros(2)
     for number in range(4):

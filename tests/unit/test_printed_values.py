@@ -15,6 +15,7 @@ from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.ensemble.describe import describe_prediction
 from mcsim.information.result import Limits
 from mcsim.instrument.beams import Beam
+from mcsim.stats.excess import HeldOut, Measured
 from mcsim.support.numbers import duration, measured, number, probability
 
 
@@ -132,3 +133,14 @@ def test_results_print_as_a_line() -> None:
 )
 def test_columns_of_a_candidate_have_names(columns, expected) -> None:
     assert CandidateResult.components.fget(SimpleNamespace(label="gain", columns=columns)) == expected
+
+
+@pytest.mark.parametrize(("sigma", "quoted"), [(0.29, True), (0.97, False)])
+def test_a_forecast_is_quoted_where_it_says_something(sigma: float, quoted: bool) -> None:
+    """ "90 % ± 97 % was predicted" stood beside what was achieved."""
+    reduction = HeldOut(
+        Measured(0.9, sigma), Measured(0.7, 0.1), Measured(90.0, 20.0), Measured(27.0, 9.0), 0.4, "half2"
+    )
+    said = words.held_out(SimpleNamespace(held_out=reduction))
+    assert ("90 %" in said) == quoted
+    assert "70 % ± 10 %" in said
