@@ -12,6 +12,7 @@ from mcsim import config
 from mcsim.datavector.filter_model import model_of
 from mcsim.datavector.map_checks import read_maps
 from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.instrument.scan import Moments
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import header, healpix
@@ -197,6 +198,18 @@ def test_what_is_not_observed_in_the_file_is_not_observed(kind, tmp_path):
     assert np.array_equal(shared.channels[0].maps[0].weight > 0, ~south)
     for made in (simulate.maps(shared, 0)[0], sampled.maps(shared, 0, epsilon=1e-3)[0][1]):
         assert np.array_equal(made == healpy.UNSEEN, south)
+
+
+def test_a_map_of_hits_adds_none_where_the_scan_does_not_go():
+    """The file is of a whole survey, the scan of its northern half: the south was in no sample of it."""
+    north = PIXEL < NPIX // 2
+    scan = Moments(NSIDE, "galactic", np.where(north, 3.0, 0.0), np.zeros((1, NPIX), dtype=np.complex128))
+    channel = {"name": "W", "beam": {"kind": "gaussian", "fwhm_arcmin": 300.0}, "scan": scan}
+    shared = survey(run_with(None, channel=[channel | {"noise": {"sigma0_uk": 20.0, "hits": HITS}}]))
+    [made] = shared.channels[0].maps
+    assert np.array_equal(made.moments.hits, np.where(north, HITS, 0.0))
+    assert made.noise_uk == pytest.approx(np.where(north, 20.0 / np.sqrt(HITS), 0.0))
+    assert np.array_equal(simulate.maps(shared, 0)[0] == healpy.UNSEEN, ~north)
 
 
 def test_samples_and_pixels_have_the_same_noise(wmap):

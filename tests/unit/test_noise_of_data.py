@@ -60,6 +60,18 @@ def test_it_is_the_half_difference(observed):
     assert level.sigma_uk == pytest.approx(np.sqrt(np.mean((half / per_unit) ** 2)), rel=1e-4)
 
 
+def test_of_few_pixels_one_goes_for_the_offset(observed):
+    """Of 6 pixels the level would be 9 % too low if 6 degrees of freedom were counted for 5."""
+    mask = np.where(np.arange(NPIX) % (NPIX // 6) == 0, 1.0, 0.0)
+    noise = {"kind": "difference", "maps": list(observed[:2]), "hits": list(HITS[:2]), "mask": mask}
+    level, used = difference_level(run_with(noise), "W"), mask > 0.0
+    weight = 1.0 / (1.0 / HITS[0] + 1.0 / HITS[1])[used]
+    difference = (observed[0] - observed[1])[used]
+    difference = difference - np.average(difference, weights=weight)
+    assert level.pixels == 6
+    assert level.sigma_uk == pytest.approx(np.sqrt(np.sum(weight * difference**2) / 5.0), rel=1e-9)
+
+
 def test_splits_have_the_noise_of_their_hits_and_the_whole_that_of_all(observed):
     noise = {"kind": "difference", "maps": list(observed[:2]), "hits": list(HITS[:2])}
     sigma = difference_level(run_with(noise), "W").sigma_uk
@@ -83,6 +95,7 @@ def test_isotropic_noise_of_part_of_the_sky():
     [whole] = survey(run).channels[0].maps
     assert whole.noise_uk[200:] == pytest.approx(np.full(NPIX - 200, level.sigma_uk / np.sqrt(2.0)))
     assert whole.noise_uk[0] == pytest.approx(level.sigma_uk)  # one split alone observed it
+    assert np.array_equal(whole.moments.hits, np.ones(NPIX))  # as the scan has them: splits of equal noise count none
 
 
 def test_hits_stand_beside_the_temperature_and_the_plan_says_the_level(observed, tmp_path):
