@@ -172,6 +172,8 @@ def test_bands_that_no_data_tell_stay_as_believed():
     np.testing.assert_allclose(fit.constrained(fitted, precision), given, atol=1e-9)
     fitted[4] = 1.5
     np.testing.assert_allclose(fit.constrained(fitted, precision), [0.3, -0.01, 0.0, 0.1, 1.5, 0.0], atol=1e-9)
+    fitted[4] = -1.5  # less power is as well detected as more
+    np.testing.assert_allclose(fit.constrained(fitted, precision), [0.3, -0.01, 0.0, 0.1, -1.5, 0.0], atol=1e-9)
     np.testing.assert_array_equal(
         systematics.get("beam_ellipticity").parametrization.constrained(fitted[:2], precision[:2, :2]), fitted[:2]
     )

@@ -112,6 +112,16 @@ def test_heading_is_that_of_the_earth(site):
     assert effect.signal(np.zeros(1), theta, phi, phi, site)[0] == pytest.approx(270.7 * np.linalg.norm(aside))
 
 
+@pytest.mark.parametrize("phase_deg", [90.0, -35.0, 180.0])
+def test_a_dipole_beside_the_motion_is_that_along_it_turned_about_the_pole(site, phase_deg):
+    """All of it: the uniform motion about the Sun, and what the ellipse adds to it."""
+    time_s = np.linspace(0.0, site.pointing.model.orbit_period_s, 20)
+    along, turned = (heading(site.pointing.model, time_s, "ecliptic", np.deg2rad(phase)) for phase in (0.0, phase_deg))
+    cos, sin = np.cos(np.deg2rad(phase_deg)), np.sin(np.deg2rad(phase_deg))
+    expected = np.stack([cos * along[0] - sin * along[1], sin * along[0] + cos * along[1], along[2]])
+    np.testing.assert_allclose(turned, expected, atol=1e-12)
+
+
 def test_a_far_lobe_is_a_beam_with_all_of_its_orders(site, tmp_path):
     """Against a total convolution with a Gaussian turned to the lobe's place, of the dipole and of a given Galaxy."""
     time_s, theta, phi, psi = samples(site)
@@ -153,6 +163,8 @@ def test_a_far_lobe_sees_the_galaxy_that_it_is_given(site, tmp_path):
     seen = model.signal(time_s, theta, phi, psi, no_dipole)
     plane = np.abs(np.cos(theta)) < 0.03
     assert seen[plane & (x > 0.5)].mean() > 5.0 * seen[np.abs(np.cos(theta)) > 0.5].mean() > 0.0
+    # 1 + x: twice the mean towards the centre of the Galaxy, nothing behind us.
+    assert seen[plane & (x > 0.9)].mean() > 10.0 * np.abs(seen[plane & (x < -0.9)]).mean()
 
 
 def test_a_far_lobe_reads_its_map_in_the_unit_of_the_header_and_again_when_it_changes(site, tmp_path):
