@@ -199,6 +199,31 @@ def test_fewer_point_sources_take_power_away(site):
     np.testing.assert_allclose((power / before)[20:], 0.9, atol=0.012)
 
 
+def test_the_power_that_sources_take_is_a_share_of_that_around_them(site):
+    """Of 5 degrees on either side, or a tenth of l; a monopole and a dipole are none of it."""
+    lmax = 90
+    sky, ell = gaussian_alm(1.0 / np.arange(2.0, lmax + 3.0) ** 2, np.random.default_rng(4)), np.arange(lmax + 1)
+    sky[0], sky[1] = 1e3, 30.0
+    found = systematics.get("point_sources")(amplitude=-1e-5).sky(sky, replace(site, lmax=lmax), draw)
+    total = np.bincount(alm_.degrees(lmax), np.where(alm_.orders(lmax) > 0, 2.0, 1.0) * np.abs(sky) ** 2)
+    for degree in (2, 6, 30, 59, 60, 85, lmax):
+        reach = max(5, degree // 10)
+        near = (ell >= max(degree - reach, 2)) & (ell <= degree + reach)
+        around = total[near].sum() / np.sum(2.0 * ell[near] + 1.0)
+        changed = alm_.degrees(lmax) == degree
+        np.testing.assert_allclose(found[changed], np.sqrt(1.0 - 1e-5 / around) * sky[changed], rtol=1e-9)
+
+
+def test_glitches_add_up_as_their_number_does():
+    """The variance is the mean number of hits times one's; 4 sigma of 40000 sums of half a hit on average."""
+    drawn = systematics.get("excess_noise")(amplitude=0.005, glitch_uk=200.0).excess(
+        np.full(40000, 100.0), np.random.default_rng(8)
+    )
+    # The relative variance of a square is kurtosis - 1 = 2 + 3 / 0.5.
+    assert np.mean(drawn**2) == pytest.approx(0.5 * 200.0**2, rel=4.0 * np.sqrt(8.0 / 40000))
+    assert np.mean(drawn == 0.0) == pytest.approx(np.exp(-0.5), abs=0.01)
+
+
 def test_foregrounds_are_fixed_to_the_galaxy_and_grow_with_frequency(site, sky):
     kind = systematics.get("foreground_residual")
     drawn = kind(amplitude=3.0).sky(sky, site, draw) - sky

@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import healpy
 import numpy as np
 import pytest
 import xarray as xr
@@ -13,7 +14,7 @@ from mcsim import config
 from mcsim.datavector import campaign
 from mcsim.datavector.repeats import check_alike
 from mcsim.ensemble.external import SEEDS, seed_of, source_of
-from mcsim.ensemble.external_maps import Part, fits_maps, in_order
+from mcsim.ensemble.external_maps import FitsMaps, Part, fits_maps, in_order
 from mcsim.errors import RunError
 from refusals import refused
 
@@ -67,6 +68,29 @@ def test_maps_of_another_frame_or_order_are_refused() -> None:
     ]:
         with refused(*named):
             in_order({"V": map_.assign_attrs({attribute: value})}, PARTS, "run.zarr")
+
+
+def test_pixels_without_data_are_so_in_any_unit() -> None:
+    """UNSEEN is no temperature: in mK it is not a thousand times as much; what is infinite stays to be refused."""
+    values = np.where(np.arange(12) < 2, healpy.UNSEEN, 0.5)
+    values[2:4] = np.nan, np.inf
+    map_ = xr.DataArray(values, dims="pixel", attrs={"units": "mK"})
+    expected = [healpy.UNSEEN, healpy.UNSEEN, np.nan, np.inf, *[500.0] * 8]
+    np.testing.assert_array_equal(in_order({"V": map_}, PARTS, "run.zarr")[0], expected)
+
+
+def test_files_are_known_by_their_contents_and_called_by_their_numbers(tmp_path: Path) -> None:
+    """What was simulated with others of the same names is not taken for them; the folder may be another."""
+
+    def written(folder: str, value: float) -> FitsMaps:
+        (tmp_path / folder).mkdir()
+        for r in (4, 9):
+            (tmp_path / folder / f"V_{r}.fits").write_text(f"{r} {value}")
+        return fits_maps(PARTS, str(tmp_path / folder / "V_{realization}.fits"))
+
+    first, moved, other = written("first", 1.0), written("moved", 1.0), written("other", 2.0)
+    assert first.identity() == moved.identity() != other.identity()
+    assert "realization 9 of" in first.words(0, 1)
 
 
 @pytest.mark.parametrize("other", ["V_a", "V/a"])

@@ -144,6 +144,14 @@ def test_units_of_variances(unit, factor):
     assert header.to_uk2(unit, Path("x")) == pytest.approx(factor)
 
 
+def test_variances_of_antenna_temperature_take_the_square_of_its_factor():
+    """At 217 GHz a kelvin of antenna temperature is 3 of the CMB's."""
+    factor = header.to_uk("K_RJ", Path("x"), 217.0)
+    assert 2.5e6 < factor < 3.5e6
+    assert header.to_uk2("K_RJ^2", Path("x"), 217.0) == pytest.approx(factor**2)
+    assert header.to_uk2("(MJy/sr)^2", Path("x"), 217.0) == pytest.approx(header.to_uk("MJy/sr", Path("x"), 217.0) ** 2)
+
+
 def noise_of(noise, **changes):
     """Return a map of a survey, and its noise in a realization: the difference with and without."""
     run = run_with(noise, **changes)

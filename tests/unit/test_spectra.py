@@ -236,6 +236,15 @@ def test_other_skies_are_accepted(tmp_path, table, header):
     np.testing.assert_allclose(found[2:], table[2:6], rtol=1e-8)
 
 
+@pytest.mark.parametrize("table", [3e-6 * LCDM, 1e-3 * np.maximum(ELL, 1.0) ** -0.5], ids=["faint", "as D_l in mK^2"])
+def test_what_states_its_unit_may_be_small(tmp_path, table):
+    """Without a unit the first may be in mK^2 or K^2, and the second has the size of D_l in mK^2."""
+    found = spectra.load(write_fits(tmp_path / "stated.fits", "uK^2", "C_ell", table), 20)
+    np.testing.assert_allclose(found, table[:21])
+    with refused(tmp_path / "silent.fits"):
+        spectra.load(write_fits(tmp_path / "silent.fits", None, "TT", table), 20)
+
+
 @pytest.mark.parametrize(("table", "header"), [(100.0 + 0.0 * ELL, ""), (D_L, "ell C_ell [uK^2]")])
 def test_a_table_that_may_be_d_l_is_taken_with_a_warning(tmp_path, table, header):
     path = write_text(tmp_path / "cl.txt", table, header)
