@@ -57,6 +57,20 @@ def test_what_acts_on_the_sky_is_the_same_in_maps_of_another_frame(effect):
     np.testing.assert_allclose(rotate_alm(here, LMAX, *FRAMES), there, rtol=0, atol=1e-6 * changed)
 
 
+def test_turned_maps_have_the_dipole_of_their_frame_and_end_at_twice_nside():
+    """Effects that follow the dipole would follow one elsewhere; degrees beyond 2 nside are not in a turned map."""
+    run = two_channels("turned", lmax=40)
+    run |= {"map": {"nside": 16}, "channel": [{**run["channel"][0], "scan": {"kind": "parallel_transport"}}]}
+    turned = survey(config.load({**run, "preparation": [{"kind": "rotate", "frame": "galactic"}]})).channels[0]
+    there = survey(config.load({**run, "map": {**run["map"], "frame": "galactic"}})).channels[0]
+    assert turned.site.frame == "galactic"
+    np.testing.assert_allclose(turned.site.dipole_uk, there.site.dipole_uk, atol=1e-6)
+    factors, whole = turned.response.factors[0], there.response.factors[0]
+    np.testing.assert_allclose(factors[:33], whole[:33], rtol=1e-12)
+    assert not factors[33:].any()
+    assert whole[33:].all()
+
+
 def test_noise_that_grows_by_a_pattern_is_the_same_in_maps_of_another_frame():
     pattern = 0.02 * np.array(RANDOM[:9])
     found = acting("NoisePattern", coefficients=tuple(pattern)).noise(site("ecliptic"))
