@@ -216,6 +216,28 @@ def test_an_effect_that_only_one_part_shows_is_absent_by_the_odds(bench):
     assert findings.odds >= DiagnosisSettings().absence_odds
 
 
+def test_odds_against_an_effect_allow_for_the_error_of_its_amplitude(bench):
+    """Its amplitude in the other part is 1 only within the error of the fit, whose variance adds to its own."""
+    signal = np.where(np.arange(16) % 8 < 4, bench.t @ THETA, 0.0)
+    tested = Slices(bench.ensemble, signal, 8, ("half1", "half2"), 24, DiagnosisSettings())
+    action, found = Action.of(bench.t @ THETA, bench.t, THETA, np.linalg.inv(bench.t.T @ bench.t)), []
+    for error in (0.1, 0.4):
+        (own,) = tested.findings([GAIN], [replace(action, error=error)]).comparisons
+        found.append(next(one for one in own if one.kind == "halves"))
+    distance = 0.5 - found[0].amplitudes[1]  # from half way between absent and as fitted
+    variances = [distance / np.log(one.odds) for one in found]
+    assert variances[1] - variances[0] == pytest.approx(0.4**2 - 0.1**2, rel=1e-6)
+
+
+def test_odds_are_over_the_number_of_comparisons_that_tell_them():
+    """Each of several has the chance of large ones; a map against all of the data tells none."""
+    ones = (1.0, 1.0)
+    halves, degrees = (Comparison(kind, ("a", "b"), ones, ones, 1.0, odds) for kind, odds in (("h", 60.0), ("d", 2.0)))
+    of_map = Comparison("map", ("a",), (1.0,), (1.0,), 1.0, 1e9)
+    assert Findings(((halves, of_map), (degrees,))).odds == pytest.approx(30.0)
+    assert Findings(((of_map,),)).odds == 1.0
+
+
 def test_what_an_effect_leaves_in_the_maps_is_tested(bench):
     extra = np.where(np.arange(16) == 9, 8.0, 0.0)
     (left,) = bench.findings(bench.t @ THETA + extra, THETA).maps
