@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from instruments import two_channels
 from mcsim import config
 from mcsim.config import arrays
 from mcsim.support import resources
@@ -69,6 +70,16 @@ def test_but_these_of_two_beams_and_a_mask_do(plain, folder, key, value, expecte
 @pytest.mark.parametrize(("key", "value"), UNIMPORTANT)
 def test_what_does_not_change_a_result_does_not_change_the_hash(plain, folder, key, value):
     assert config.digest(config.load(changed(plain, key, value))) == config.digest(config.load(plain))
+
+
+def test_bins_of_filtered_maps_are_part_of_the_estimates():
+    """Those of a summary are made anew from what is stored."""
+    for filtered in (True, False):
+        biposh = {"L_max": 2} | ({"filter": "inverse_covariance"} if filtered else {})
+        runs = [config.load(two_channels("bins") | {"biposh": biposh | {"summary_bin": n}}) for n in (10, 20)]
+        changes = config.differences(*map(config.science, runs))
+        assert changes == (["biposh.bin: 10 -> 20"] if filtered else [])
+        assert (config.digest(runs[0]) == config.digest(runs[1])) != filtered
 
 
 IMPORTANT = [
