@@ -5,6 +5,7 @@ import pytest
 
 from mcsim.comparison import report
 from mcsim.comparison.effects import EffectDifference
+from mcsim.comparison.missing import not_compared
 from mcsim.comparison.result import ChannelResult, DifferenceResult, NotCompared
 from mcsim.systematics.beams import BeamSidelobe
 
@@ -40,6 +41,12 @@ def test_sign_that_misleads_is_explained() -> None:
 )
 def test_a_map_that_is_not_compared_is_said_to_lack_on_each_side(missing_on, words) -> None:
     assert NotCompared("W1", missing_on).words == words
+
+
+def test_without_a_model_no_map_is_said_to_lack_in_it(tmp_path) -> None:
+    sides = {"V1": np.zeros(12)}, {"V1": np.zeros(12), "W1": np.zeros(12)}
+    with pytest.warns(UserWarning, match="W1, which side A lacks"):
+        assert not_compared((tmp_path / "a.toml", tmp_path / "b.toml"), sides, None) == (NotCompared("W1", ("a",)),)
 
 
 @pytest.mark.parametrize(

@@ -82,6 +82,16 @@ def test_bins_of_filtered_maps_are_part_of_the_estimates():
         assert (config.digest(runs[0]) == config.digest(runs[1])) != filtered
 
 
+def test_a_step_names_files_of_its_own_channels_alone(tmp_path):
+    """The other channel has no such file, and needs none."""
+    (tmp_path / "V1.fits").write_text("mask")
+    step = {"kind": "mask", "mask": str(tmp_path / "{channel}.fits"), "channels": ["V1"]}
+    run = config.load(two_channels("steps") | {"preparation": [step]})
+    assert list(config.science(run)["preparation"][0]["mask"]) == ["V1"]
+    with refused("preparation[0].mask", tmp_path / "W1.fits"):
+        config.load(two_channels("steps") | {"preparation": [step | {"channels": []}]})
+
+
 IMPORTANT = [
     ("sky.lmax", 100, ["biposh.lmax: 128 -> 100", "sky.lmax: 128 -> 100"]),
     ("sky.spectrum", "planck2018", [r"sky.spectrum: contents sha256:"]),
