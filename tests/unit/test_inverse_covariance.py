@@ -8,7 +8,7 @@ import pytest
 
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments
-from mcsim.simulation import convolve
+from mcsim.simulation import convolve, inverse_covariance
 from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap, product
 from mcsim.sphere import alm as alm_
 from mcsim.sphere.sky import gaussian_alm
@@ -128,6 +128,25 @@ def test_filter_of_uniform_noise_is_the_isotropic_one() -> None:
     b = beam.factors[0].real
     expected = alm_.multiply(alm, CL * b**2 / (CL * b**2 + noise_power), LMAX)
     assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
+
+
+def test_iterations_begin_at_what_is_near(case, monkeypatch) -> None:
+    """At the solution itself they end at once: maps are made once, to see what is left of the system."""
+    filtered, _, _ = case
+    weighted = filtered.adjoint(filtered.weighted(filtered.draw("near", 0)))
+    seen, observe, found = [], filtered.observe, filtered.solve(weighted)
+    monkeypatch.setattr(filtered, "observe", lambda sky: seen.append(sky) or observe(sky))
+    again = filtered.solve(weighted, found)
+    assert len(seen) == 1
+    np.testing.assert_allclose(again, found, rtol=0, atol=1e-9 * np.abs(found).max())
+
+
+def test_what_does_not_converge_is_no_result(case, monkeypatch) -> None:
+    filtered, _, _ = case
+    weighted = filtered.adjoint(filtered.weighted(filtered.draw("far", 0)))
+    monkeypatch.setattr(inverse_covariance, "ITERATIONS", 3)
+    with refused(3):
+        filtered.solve(weighted)
 
 
 def test_an_approach_does_not_jump_between_maps(case) -> None:

@@ -274,6 +274,15 @@ def test_what_is_beside_more_noise_is_not_looked_for(stage, first, count):
     assert [one.structure for one in found] == [0, 1][:count]
 
 
+@pytest.mark.parametrize(("second", "count"), [(7.0, 1), (12.0, 2)])
+def test_what_falls_by_less_than_a_tenth_of_the_first_is_no_second(second, count):
+    """It may be the square of the first: 49 beside 900, which chance does not make, and 144 is one."""
+    simulations = np.random.default_rng(1).normal(size=(400, 2))
+    search = Search((plain("one", [0]), plain("other", [1])), simulations)
+    assert [one.structure for one in search.run(np.array([30.0, second]))] == [0, 1][:count]
+    assert [one.structure for one in search.run(np.array([0.0, second]))] == [1]
+
+
 def test_power_of_one_channel_is_judged_by_that_of_the_sum_of_its_splits():
     """Their products are below zero on average, where the sky is taken out of their sum: more power is more of it."""
     n, a, left = 500, 10.0, 0.3
@@ -293,6 +302,7 @@ def test_power_of_one_channel_is_judged_by_that_of_the_sum_of_its_splits():
     promised = more**2 / (2.0 * n * (left**4 + 1.0))  # by the score, whose variance is that of both squares
     share = 2.0 * (a - np.log1p(a)) / a**2
     assert fall == pytest.approx(promised * share, rel=5.0 * np.sqrt(2.0 / 400))
+    assert search._falls(mean - np.array([0.0, 0.5 * n * left**2]))[1] == 0.0  # nothing that is added takes power away
 
 
 def test_a_choice_among_many_is_charged():
