@@ -130,6 +130,12 @@ def test_filter_of_uniform_noise_is_the_isotropic_one() -> None:
     assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
 
 
+def test_draws_are_zero_where_nothing_is_observed(case) -> None:
+    filtered, _, _ = case
+    drawn = filtered.draw("any", 0)
+    np.testing.assert_array_equal(drawn != 0.0, filtered.precision > 0.0)
+
+
 def test_iterations_begin_at_what_is_near(case, monkeypatch) -> None:
     """At the solution itself they end at once: maps are made once, to see what is left of the system."""
     filtered, _, _ = case
