@@ -142,7 +142,8 @@ def test_pairs_are_of_one_class_whichever_channels_and_splits_they_are_of():
     assert same(("V1a", "W1b"), ("V1b", "W1a"))
     for one, other in (
         ("V1half112", "W1half112"),  # the same channel or another one
-        ("W1half202", "V1half112"),  # the same split or another one
+        ("W1half202", "V1half112"),  # the same map or another one
+        ("V1half102", "V1half212"),  # the same split or another one
         ("W1half1012", "V1half112"),  # another range of degrees
         ("W1half102", "W1half202"),  # another order
     ):

@@ -14,6 +14,7 @@ from mcsim.instrument.scan.model import LineOfSight
 from mcsim.instrument.scan.pointing import pointing
 from mcsim.simulation import convolve, mapmaking, tod
 from mcsim.simulation.mapmaking import pairs
+from mcsim.simulation.mapmaking.rhs import noise_by_chunk
 from mcsim.simulation.mapmaking.solve import apply_normal
 from mcsim.sphere.sky import dipole_alm, gaussian_alm
 from refusals import refused
@@ -247,6 +248,17 @@ def test_noise_has_the_normal_matrix_as_covariance(scan):
     assert rank == np.count_nonzero(scan.hits_a + scan.hits_b) - 1
     chi_square = rhs @ np.linalg.pinv(normal, hermitian=True) @ rhs / 7.0**2
     assert abs(chi_square - rank) < 4.0 * np.sqrt(2.0 * rank)
+
+
+def test_a_difference_has_the_mean_of_the_variances_of_its_pixels(scan):
+    """With factors of 0 and 4 by turns: noise of both pixels would be none where one of them has none."""
+    factor = np.where(np.arange(scan.npix) % 3 == 0, 4.0, 0.0)
+    nothing = (np.zeros((scan.npix, 1)), np.zeros((scan.npix, 1)))
+    found = mapmaking.rhs_from_maps(scan, [nothing], noise=replace(noise(7.0, 7), factor=factor))[0]
+    pieces = tod.chunks(*scan.grid.sample_range(MODEL, SIDES[0]))
+    draw, matrix = noise_by_chunk(noise(7.0, 7), pieces), pointing_matrix(scan, 0.0)
+    each = np.sqrt(0.5 * np.abs(matrix) @ factor) * np.concatenate([draw(*one) for one in pieces])
+    np.testing.assert_allclose(found, each @ matrix, rtol=0, atol=1e-9 * np.abs(found).max())
 
 
 def test_threads_do_not_change_a_bit(scan, sky, beams, monkeypatch):
