@@ -6,7 +6,7 @@ import pytest
 
 import mcsim
 from mcsim.comparison.scene import Scene
-from mcsim.comparison.sky_of_maps import TRUSTED, averaged, sky_in
+from mcsim.comparison.sky_of_maps import TRUSTED, averaged, mean_map, sky_in
 from mcsim.sphere import healpix
 
 NSIDE, LMAX = 16, 32
@@ -62,3 +62,9 @@ def _left(scene: Scene, sky: np.ndarray, seen: np.ndarray) -> float:
     """Return what the simulation of a sky leaves of the scene's maps where they are seen, over their rms."""
     rest = (scene.maps() - Scene(sky, scene.beam, scene.window, scene.moments).maps())[seen]
     return float(rest.std() / scene.maps()[seen].std())
+
+
+def test_the_mean_of_maps_is_that_of_those_that_see_a_pixel():
+    maps = np.array([[1.0, 2.0, 5.0, 7.0], [3.0, -9.0, 5.0, 8.0]])
+    seen = np.array([[True, True, False, False], [True, False, True, False]])
+    assert mean_map(maps, seen).tolist() == [2.0, 2.0, 5.0, 0.0]
