@@ -171,7 +171,8 @@ class Preparation:
         """Return hits, sums over the prepared pixels, and orientation moments, plain means as of the temperatures."""
         hits, w = moments.hits, np.where(moments.hits > 0, moments.w, np.nan)
         for step in self.steps:
-            hits = step.local(hits)
+            # A filled pixel counts in a mean of temperatures, but nothing was observed there.
+            hits = np.nan_to_num(step.local(hits)) if isinstance(step, Filled) else step.local(hits)
             # A file of moments has no orders for a beam that is circular.
             w = step.orientations(w) if len(w) else np.zeros((0, hits.size), dtype=np.complex128)
         hits = hits * (moments.nside / self.nside) ** 2

@@ -223,7 +223,7 @@ def _read_text(path: Path) -> tuple[NDArray[np.float64], str, bool]:
     factors = {_factor(path, match[0]) for match in _UNIT.finditer(header)}
     if len(factors) > 1:
         raise InputError(f"power spectrum {str(path)!r} names several units in its header lines; leave one of them.")
-    return cl * factors.pop() if factors else cl, header, bool(factors)
+    return cl * max(factors, default=1.0), header, bool(factors)
 
 
 def _read_fits(path: Path) -> tuple[NDArray[np.float64], str, bool]:

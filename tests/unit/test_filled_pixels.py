@@ -58,3 +58,11 @@ def test_filled_pixels_have_no_samples():
     found = prepared(FILL | {"mask": MASK}).moments(moments)
     assert np.array_equal(found.hits, 9.0 * MASK)
     assert np.array_equal(found.w, moments.w * MASK)
+
+
+@pytest.mark.parametrize("hidden", [True, False], ids=["masked", "not observed"])
+def test_hits_of_coarse_pixels_are_those_of_what_was_observed(hidden):
+    """Those of a masked pixel were the mean of the others."""
+    steps = prepared(FILL | ({"mask": MASK} if hidden else {}), DEGRADE)
+    moments = Moments(FINE, "ecliptic", 9.0 * (np.ones(NPIX) if hidden else MASK), np.zeros((2, NPIX), complex))
+    assert steps.moments(moments).hits == pytest.approx(9.0 * 16.0 * prepared(DEGRADE).apply(MASK))

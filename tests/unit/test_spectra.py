@@ -229,6 +229,8 @@ def test_tables_in_other_units_or_of_d_l(tmp_path, table, header, named):
         (LCDM * np.maximum(ELL, 1.0) ** -1.0, ""),
         (1e5 * np.maximum(ELL, 1.0) ** -2.5, ""),
         (LCDM[:6], ""),
+        (3e-6 * LCDM, "ell C_ell [uK^2]"),
+        (1e-3 * np.maximum(ELL, 1.0) ** -0.5, "ell C_ell [uK^2]"),
     ],
 )
 def test_other_skies_are_accepted(tmp_path, table, header):
