@@ -1,9 +1,10 @@
-"""Localise a departure from the model: rank groups of numbers, and standardise residual maps."""
+"""Localise a departure from the model: rank groups of numbers, standardise residual maps, find what stands out."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from mcsim.datavector.summaries import Element
 from mcsim.stats.look_elsewhere import deviations, scan_pvalues
@@ -83,3 +84,22 @@ def standardised(x: Map, mean: Map, scatter: Map, count: int) -> Map:
     seen = scatter > 0.0
     scale = np.sqrt((1.0 + 1.0 / count) * (count - 1.0) / (count - 3.0))
     return np.where(seen, (x - mean) / np.where(seen, scatter, 1.0) / scale, np.nan)
+
+
+def outstanding(maps: Matrix, count: int, level: float) -> list[tuple[int, int, float]]:
+    """Return map, pixel and size of what stands out of each standardised residual map, (map, npix), that has such.
+
+    It is the largest residual of a map over the scatter of that map, which what acts everywhere widens, if pixels that
+    are independent have one as large with a probability of at most ``level`` by chance. ``count`` > 3 simulations told
+    their scatter: the deviates are those of Student's t.
+    """
+    found = []
+    for number, one in enumerate(maps):
+        distance = np.abs(one - np.nanmedian(one)) if np.isfinite(one).any() else np.zeros(1)
+        scatter = float(np.nanmedian(distance)) / stats.norm.ppf(0.75)
+        pixel = int(np.nanargmax(distance))
+        size = float(distance[pixel]) / scatter if scatter > 0.0 else 0.0
+        chance = 2.0 * stats.t.sf(size * np.sqrt((count - 1.0) / (count - 3.0)), count - 1)
+        if chance * int(np.isfinite(maps).sum()) <= level:
+            found.append((number, pixel, size))
+    return found

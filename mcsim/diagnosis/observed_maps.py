@@ -10,7 +10,7 @@ import numpy as np
 
 from mcsim import config
 from mcsim.datavector.candidate import Candidate
-from mcsim.datavector.localisation import Place, places, standardised
+from mcsim.datavector.localisation import Place, outstanding, places, standardised
 from mcsim.datavector.map_checks import exchanges, share_left_out
 from mcsim.datavector.nuisances import half_given_other
 from mcsim.datavector.same_skies import SameSkies, Skies
@@ -18,6 +18,8 @@ from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.output import DIGEST, digest
 from mcsim.support.arrays import Map, Matrix, Vector
 from mcsim.systematics import if_possible
+
+STANDS_OUT = 1e-6  #: probability up to which what stands out of a residual map is no chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +206,21 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         ensemble = self.context.ensemble
         drawn = len(ensemble.bipolar_scan)
         return standardised(self._measured[2], ensemble.residual_mean, ensemble.residual_scatter, drawn)
+
+    def notes(self) -> list[str]:
+        """Return a sentence on each map of whose residual one place stands out as hardly any effect lets it."""
+        maps, model = self.residual_maps(), self.context.analysis.model
+        nside = healpy.npix2nside(maps.shape[1])
+        said = []
+        for number, pixel, size in outstanding(maps, len(self.context.ensemble.bipolar_scan), STANDS_OUT):
+            lon, lat = (round(float(angle)) for angle in healpy.pix2ang(nside, pixel, lonlat=True))
+            where = f"longitude {lon}°, latitude {lat}° ({model.frame})".replace("-", "−")
+            said.append(
+                f"One place of the residual of {model.parts[number].name} stands out, {size:.0f} times its scatter: "
+                f"{where}. Glitches, sources and the Galaxy look so, and effects on beam, gain or noise do not: leave "
+                "its pixels out and diagnose the maps again."
+            )
+        return said
 
     def provenance(self) -> dict[str, str | int]:
         """Return the hash of the maps."""
