@@ -1,5 +1,9 @@
 """Beams from tables of B_l, in the layouts of WMAP and Planck."""
 
+import bz2
+import gzip
+import lzma
+
 import healpy
 import numpy as np
 import pytest
@@ -122,6 +126,15 @@ def test_a_text_that_says_that_it_is_squared_is_refused(header, comments, name, 
 def test_a_text_with_a_byte_order_mark_is_read(tmp_path):
     path = tmp_path / "window.txt"
     np.savetxt(path, WINDOW, header="B_l", encoding="utf-8-sig")
+    np.testing.assert_array_equal(read_window(path), WINDOW)
+
+
+@pytest.mark.parametrize("ending", [".gz", ".bz2", ".xz"])
+def test_a_packed_text_is_read(ending, tmp_path):
+    path = tmp_path / f"window.txt{ending}"
+    np.savetxt(tmp_path / "window.txt", WINDOW, header="B_l")
+    packed = {".gz": gzip.compress, ".bz2": bz2.compress, ".xz": lzma.compress}[ending]
+    path.write_bytes(packed((tmp_path / "window.txt").read_bytes()))
     np.testing.assert_array_equal(read_window(path), WINDOW)
 
 

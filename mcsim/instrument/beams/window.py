@@ -1,6 +1,8 @@
 """Beam windows B_l: text tables such as WMAP's, FITS tables such as Planck's, .npy files, arrays."""
 
+import bz2
 import gzip
+import lzma
 import re
 import warnings
 from pathlib import Path
@@ -27,6 +29,8 @@ SQUARED = re.compile(r"(?i)^w_?(l|ell)$|^b_?(l|ell)_?\^?(2|sq|squared)$|_2_")
 """Names of columns of W_l = B_l^2; those of Planck's HFI have _2_ in them."""
 
 _SAID_SQUARED = re.compile(r"(?i)(?<![a-z])(w[_({]*(l|ell)(?![a-z])|b_?\{?(l|ell)\}?\s*(\^|\*\*)\s*\{?2)|squared")
+
+_UNPACK = {".gz": gzip.decompress, ".bz2": bz2.decompress, ".xz": lzma.decompress}  #: of texts that numpy reads packed
 
 LARGEST = 1.05  #: of |B_l| over B_0: more is no beam
 
@@ -71,8 +75,7 @@ def _is_fits(path: Path) -> bool:
 def _of_text(path: Path) -> Window:
     with unreadable(path, "a table of B_l", "give columns ell and B_l"), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of an empty file, which is refused
-        contents = path.read_bytes()
-        lines = (gzip.decompress(contents) if path.suffix == ".gz" else contents).decode("utf-8-sig", "replace")
+        lines = _UNPACK.get(path.suffix, bytes)(path.read_bytes()).decode("utf-8-sig", "replace")
         table = np.loadtxt(lines.splitlines(), ndmin=2)
         comments = [line.strip() for line in lines.splitlines() if line.lstrip().startswith("#")]
     said = next((line for line in comments if _SAID_SQUARED.search(line)), None)
