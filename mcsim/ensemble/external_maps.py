@@ -134,11 +134,10 @@ def in_uk(one: Any, name: str, frame: str, frequency_ghz: float | None) -> Map:
     ``name`` names it in messages. InputError for no array of numbers, or if its attributes ``frame`` or ``ordering``
     say another frame or another order than RING. Their other usual names are read too (:data:`ATTRIBUTES`).
     """
-    given = getattr(one, "attrs", {}).items()
-    own = {str(key).strip().lower(): str(value) for key, value in given if value is not None}
+    own = {str(key).strip().lower(): _word(value) for key, value in (getattr(one, "attrs", None) or {}).items()}
     if own.get("order", "").isdecimal():  # that of the resolution: 5 is nside 32
         del own["order"]
-    said = {key: next((own[n] for n in (key, *names) if n in own), None) for key, names in ATTRIBUTES.items()}
+    said = {key: next((own[n] for n in (key, *names) if own.get(n)), None) for key, names in ATTRIBUTES.items()}
     found = reals(one, name, healpy.UNSEEN)
     factor = header.to_uk(said["units"], Path(name), frequency_ghz)
     stated = header.frame_named(said["frame"], name, "frame")
@@ -148,6 +147,13 @@ def in_uk(one: Any, name: str, frame: str, frequency_ghz: float | None) -> Map:
     if order != "RING":
         raise InputError(f"{name} has ordering = {order!r}, but maps in memory and stores are RING; reorder it first.")
     return np.where((found > UNSEEN_BELOW) | ~np.isfinite(found), factor * found, healpy.UNSEEN)
+
+
+def _word(value: Any) -> str:
+    """Return an attribute as text, of bytes, as HDF5 files hold them, too; empty for None."""
+    return (
+        "" if value is None else (value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)).strip()
+    )
 
 
 def parts_of(run: config.RunConfig) -> Iterator[Part]:
