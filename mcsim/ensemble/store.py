@@ -26,7 +26,7 @@ from zarr.storage import MemoryStore
 from mcsim.ensemble.datasets import Files, write_dataset, write_files
 from mcsim.ensemble.layout import Layout, listed
 from mcsim.errors import InputError, RunError
-from mcsim.support.folders import is_full, outside_stores, unwritable, write_whole
+from mcsim.support.folders import exchanged, is_full, outside_stores, unwritable, write_whole
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -324,9 +324,12 @@ def write_summary(path: Path, summary: "xr.Dataset") -> None:
         encoding = {name: _CODECS | _absent_value(array.dtype) for name, array in summary.variables.items()}
         write_dataset(summary, Path(scratch) / "summary", encoding=encoding, **form)
         _forget_summary(path)  # what ends before the metadata are written has none, not one that is described wrongly
-        with suppress(FileNotFoundError):
-            os.replace(path / "summary", Path(scratch) / "former")
-        os.replace(Path(scratch) / "summary", path / "summary")
+        new, former = Path(scratch) / "summary", path / "summary"
+        # Who has opened the former one reads NaN for files that are not there.
+        if not exchanged(new, former):
+            with suppress(FileNotFoundError):
+                os.replace(former, Path(scratch) / "former")
+            os.replace(new, former)
         _consolidate(path)
 
 

@@ -7,6 +7,7 @@ import os
 import shutil
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -136,6 +137,25 @@ def test_a_summary_that_a_run_replaces_is_waited_for(copy: Path) -> None:
         later.start()
         xr.testing.assert_identical(opening.open_summary(copy).load(), expected)
         later.join()
+
+
+def test_a_summary_is_never_away_while_it_is_replaced(copy: Path) -> None:
+    """Who had opened it read NaN then."""
+    summary, missed, end = opening.open_summary(copy).load(), list[bool](), threading.Event()
+
+    def look() -> None:
+        while not end.is_set():
+            missed.append(not (copy / "summary" / "zarr.json").exists())
+
+    with ThreadPoolExecutor(1) as pool:
+        looking = pool.submit(look)
+        for _ in range(20):
+            store.write_summary(copy, summary)
+        end.set()
+        looking.result()
+    assert missed
+    assert not any(missed)
+    assert not [entry for entry in copy.parent.iterdir() if entry.name.startswith(".copy")]
 
 
 @pytest.mark.parametrize("part", ["biposh/c/1", "cl", "ell/c/0", "summary/cl_mean"])
