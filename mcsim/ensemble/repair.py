@@ -2,8 +2,10 @@
 
 import re
 import shutil
+import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,8 @@ from mcsim.support.folders import user_path
 from mcsim.support.progress import reporting
 
 THREADS = 4
+
+LOOKING_S = 60.0  #: age from which a file beside a store is none of a run that is about to look for the lock
 
 
 @dataclass(frozen=True)
@@ -112,8 +116,9 @@ def sweep(path: Path) -> None:
     scratch = re.compile(rf"\.{re.escape(path.name)}\.[a-z0-9_]{{8}}")  # tempfile's names
     beside, inside = path.absolute().parent.iterdir(), path.glob(".*")
     for left in [entry for entry in (*beside, *inside) if scratch.fullmatch(entry.name)]:
-        if left.is_file():
-            left.unlink(missing_ok=True)
+        with suppress(FileNotFoundError):
+            if left.is_file() and time.time() - left.stat().st_mtime > LOOKING_S:
+                left.unlink()
         shutil.rmtree(left, ignore_errors=True)
 
 

@@ -91,6 +91,8 @@ def test_what_a_killed_run_or_merge_left_goes_with_its_lock(small_store: Path, c
     left = [tmp_path / ".m.zarr.abcd1234", tmp_path / ".x.zarr.abcd1234", run / "cl" / "zarr.0123456789abcdef.partial"]
     for path in left:
         path.touch()
+        os.utime(path, (0, 0))
+    (looking := tmp_path / ".x.zarr.efgh5678").touch()  # as another run has it that is about to look for the lock
     runner.run(table(), run, workers=client)
     assert all(one.exists() for one in left)  # those of others, for all that is known
     left.append(run / ".x.zarr.abcd1234")
@@ -100,6 +102,7 @@ def test_what_a_killed_run_or_merge_left_goes_with_its_lock(small_store: Path, c
     lock_of_the_dead(merged)
     runner.merge([small_store], merged)
     assert not any(one.exists() for one in left)
+    assert looking.exists()
     assert_same(merged, small_store)
 
 
