@@ -20,6 +20,7 @@ from mcsim.support.numbers import number
 DOTS_PER_INCH = 110
 SHOWN = 64  #: nside of the maps in pictures
 _TICKS = [digit * 10**power for power in range(9) for digit in (1, 2, 5)]  #: multipoles or samples that an axis names
+_MOST_TICKS = 9  #: of which the numbers stand apart; of more, powers of ten
 _LETTERS = 40  #: of a line of the words beside the maps
 _LEGEND: dict[str, Any] = {
     "frameon": False,
@@ -93,7 +94,10 @@ def _draw_map(axes: Axes, values: NDArray[np.float64], title: str, signed: bool)
 
 def _plain_ticks(axes: Axes, low: float, high: float) -> None:
     """Write few round numbers at a logarithmic x axis that spans these values, and no others."""
-    axes.set_xticks([tick for tick in _TICKS if low <= tick <= high] or [low, high])
+    ticks = [tick for tick in _TICKS if low <= tick <= high]
+    if len(ticks) > _MOST_TICKS:
+        ticks = [tick for tick in ticks if str(tick).startswith("1")]
+    axes.set_xticks(ticks or [low, high])
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
     axes.xaxis.set_minor_locator(NullLocator())
 

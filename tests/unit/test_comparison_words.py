@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from mcsim.comparison import report
 from mcsim.comparison.effects import EffectDifference
@@ -74,3 +75,20 @@ def test_names_with_the_signs_of_mathematics_are_drawn_as_they_are() -> None:
     picture = report.figure(found)
     picture.draw_without_rendering()
     assert "A: a$_$b" in picture.axes[0].get_title()
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "ticks"),
+    [
+        (2, 64, [2, 5, 10, 20, 50]),
+        (2, 4096, [10, 100, 1000]),
+        (3.0, 3e5, [10, 100, 1000, 10000, 100000]),
+        (31.0, 42.0, [31.0, 42.0]),
+    ],
+)
+def test_numbers_at_an_axis_stand_apart(low, high, ticks):
+    """From nside 1024 on those of the last multipoles were written over each other, and of all hits."""
+    axes = Figure().subplots()
+    axes.semilogx([low, high], [1.0, 2.0])
+    report._plain_ticks(axes, low, high)
+    assert [*axes.get_xticks()] == ticks
