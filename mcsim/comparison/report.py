@@ -82,7 +82,7 @@ def _draw_map(axes: Axes, values: NDArray[np.float64], title: str, signed: bool)
     middle = 0.0 if signed else mean
     rms = float(np.sqrt(np.nanmean((values - middle) ** 2)))
     words = (
-        f"rms {number(rms)} µK" if abs(middle) < 0.1 * rms else f"mean {number(mean)}, rms about it {number(rms)} µK"
+        f"rms {number(rms)} µK" if abs(middle) <= 0.1 * rms else f"mean {number(mean)}, rms about it {number(rms)} µK"
     )
     largest = float(np.nanquantile(np.abs(values - middle), 0.995)) or 1.0
     shown = mollweide(axes, coarse, 500, cmap="RdBu_r", vmin=middle - largest, vmax=middle + largest)

@@ -135,7 +135,7 @@ def in_uk(one: Any, name: str, frame: str, frequency_ghz: float | None) -> Map:
     say another frame or another order than RING. Their other usual names are read too (:data:`ATTRIBUTES`).
     """
     own = {str(key).strip().lower(): _word(value) for key, value in (getattr(one, "attrs", None) or {}).items()}
-    if own.get("order", "").isdecimal():  # that of the resolution: 5 is nside 32
+    if own.get("order", "").removesuffix(".0").isdecimal():  # that of the resolution: 5 is nside 32
         del own["order"]
     said = {key: next((own[n] for n in (key, *names) if own.get(n)), None) for key, names in ATTRIBUTES.items()}
     found = reals(one, name, healpy.UNSEEN)
@@ -150,10 +150,11 @@ def in_uk(one: Any, name: str, frame: str, frequency_ghz: float | None) -> Map:
 
 
 def _word(value: Any) -> str:
-    """Return an attribute as text, of bytes, as HDF5 files hold them, too; empty for None."""
-    return (
-        "" if value is None else (value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)).strip()
-    )
+    """Return an attribute as text, of bytes, as HDF5 files hold them, too; empty for what says nothing."""
+    if value is None:
+        return ""
+    word = (value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)).strip()
+    return "" if word.lower() in header.SILENT else word
 
 
 def parts_of(run: config.RunConfig) -> Iterator[Part]:

@@ -25,7 +25,7 @@ _KELVIN = re.compile(
 )
 # Of a base that ends without a sign, for K^-2 is no square.
 _SQUARE = re.compile(r"(?!1\s*/)\(?([^()]*?[^()\s^*+/−-])\)?\s*(?:\^|\*\*)?\s*\(?2\)?")
-_SILENT = {"", "unknown", "none", "n/a", "undefined"}
+SILENT = {"", "unknown", "none", "n/a", "undefined"}  #: words of a header that say nothing
 
 _FRAMES = {
     "ecliptic": ("e", "ecl", "ecliptic"),
@@ -73,6 +73,8 @@ def read_coefficients(path: Path, what: str) -> tuple[Alm, int, fits.Header]:
         ell = np.floor(np.sqrt(np.maximum(index - 1, 0))).astype(np.int64)
         lmax, mmax = int(ell.max()), int((index - ell * (ell + 1) - 1).max())
         rows = healpy.Alm.getsize(lmax, mmax) if mmax >= 0 else 0
+        if index.min() < 1:
+            raise ValueError(f"its first column has {index.min()}, where the index l(l + 1) + m + 1 is 1 or more")
         if np.unique(index).size < index.size or index.size != rows:  # healpy would put them in other places
             raise ValueError(f"it has {index.size} rows, where every l up to {lmax} and m up to {mmax} make {rows}")
         packed, mmax = healpy.read_alm(table, return_mmax=True)
@@ -86,7 +88,7 @@ def frame_named(coordsys: object, where: str, key: str = "COORDSYS") -> str | No
     Raise InputError for a word that names none of the three frames.
     """
     word = str(coordsys or "").strip().lower()
-    if word in _SILENT:
+    if word in SILENT:
         return None
     for frame, words in _FRAMES.items():
         if word in words:
@@ -130,7 +132,7 @@ def to_uk(unit: str | None, path: Path, frequency_ghz: float | None = None) -> f
     2 nu^2 k / c^2 for antenna (Rayleigh-Jeans) temperature. A wide band needs its own factor.
     """
     text = (unit or "").strip().replace("µ", "u").replace("μ", "u")
-    if text.lower() in _SILENT:
+    if text.lower() in SILENT:
         return 1.0
     kelvin = _KELVIN.fullmatch(text.lower())
     if kelvin and not kelvin[3]:
@@ -153,7 +155,7 @@ def to_uk2(unit: str | None, path: Path, frequency_ghz: float | None = None) -> 
 
     Raise InputError for a unit that is no square of what :func:`to_uk` knows.
     """
-    if (unit or "").strip().lower() in _SILENT:
+    if (unit or "").strip().lower() in SILENT:
         return 1.0
     squared = _SQUARE.fullmatch(str(unit).strip())
     if squared is None:

@@ -25,7 +25,7 @@ from mcsim.sphere.checks import (
     check_whole,
     nside_of,
 )
-from mcsim.sphere.header import first_table, opened, stated_frame, to_uk
+from mcsim.sphere.header import SILENT, first_table, opened, stated_frame, to_uk
 from mcsim.support.arrays import Alm, Cl, Map, Maps, Matrix, Vector
 from mcsim.support.code import package_digest
 from mcsim.support.folders import cached, unreadable
@@ -301,7 +301,8 @@ def read_map(
             keywords, found = table.header, stated_frame(hdus, str(path))
             bad_data = keywords.get("BAD_DATA", hdus[0].header.get("BAD_DATA"))
     stated = (f"TUNIT{number + 1}", *(() if names else ("BUNIT", "UNITS")))  # these are of temperatures
-    unit = next((word for key in stated if (word := str(keywords.get(key, "")).strip())), None)
+    said = (str(keywords.get(key, "")).strip() for key in stated)
+    unit = next((word for word in said if word.lower() not in SILENT), None)
     if str(keywords.get("TEMPTYPE", "")).strip().upper().startswith("ANT"):
         unit = f"{unit or 'K'} antenna"
     if frame is not None and found not in (None, frame):
@@ -400,7 +401,7 @@ def _whole(path: Path, pixels: NDArray, values: Map, npix: int) -> Map:
     """Return a map of ``npix`` pixels with the values of those that are listed; InputError for what lists no pixels."""
     wrong = pixels.size != values.size or pixels.dtype.kind not in "iuf" or not np.all(pixels == np.floor(pixels))
     if wrong or (pixels.size and not 0 <= pixels.min() <= pixels.max() < npix):
-        extent = "" if wrong else f", but {pixels.min():g} to {pixels.max():g}"
+        extent = "" if wrong else f", but {int(pixels.min())} to {int(pixels.max())}"
         raise InputError(
             f"{path} has pixel numbers that are not whole ones from 0 to {npix - 1}, one for each value{extent}; "
             "correct them or NSIDE."

@@ -158,3 +158,13 @@ def test_a_file_that_lacks_rows_or_has_some_twice(tmp_path, beam, rows, named) -
     fits.BinTableHDU(data).writeto(path, overwrite=True)
     with refused(path, *named):
         Beam.from_blm(path)
+
+
+def test_coefficients_that_count_from_zero_are_refused_by_it(tmp_path, beam) -> None:
+    path = write(tmp_path / "beam.alm.fits", beam)
+    with fits.open(path) as hdus:
+        data = hdus[1].data.copy()
+    data["index"] -= 1
+    fits.BinTableHDU(data).writeto(path, overwrite=True)
+    with refused(path, "index", 0):
+        Beam.from_blm(path)

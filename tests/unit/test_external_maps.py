@@ -57,7 +57,8 @@ def test_maps_of_another_frame_or_order_are_refused() -> None:
     np.testing.assert_array_equal(in_order({"V": map_}, PARTS, "run.zarr")[0], 1000.0 * map_.values)
     other = xr.DataArray(map_.values, dims="pixel", attrs={"Unit": "mK", "order": 0})
     np.testing.assert_array_equal(in_order({"V": other}, PARTS, "run.zarr")[0], 1000.0 * map_.values)
-    for attributes in ({"units": "", "unit": "mK"}, {"units": b"mK"}):  # an empty one says nothing; HDF5 holds bytes
+    silent = {"units": "", "unit": "mK"}, {"units": "unknown", "unit": "mK"}
+    for attributes in (*silent, {"units": b"mK", "order": 0.0}):  # HDF5 holds bytes
         given = map_.drop_attrs().assign_attrs(attributes)
         np.testing.assert_array_equal(in_order({"V": given}, PARTS, "run.zarr")[0], 1000.0 * map_.values)
     with refused("run.zarr", "NESTED", "RING"):

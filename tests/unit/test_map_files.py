@@ -82,10 +82,11 @@ def test_a_table_of_other_pixels_than_its_header_says(tmp_path) -> None:
 
 @pytest.mark.parametrize("keyword", ["BUNIT", "UNITS"])
 def test_a_unit_of_the_whole_table_is_that_of_temperatures(tmp_path, keyword: str) -> None:
-    columns = ("TEMPERATURE", "D", MAP, {}), ("N_OBS", "D", MAP, {})
-    path = written(tmp_path / "unit.fits", *columns, **{keyword: "mK"})
-    np.testing.assert_allclose(healpix.read_uk(path, "ecliptic", None), 1e3 * MAP)
-    assert healpix.read_map(path, healpix.HITS)[2] is None
+    for silent in ({}, {"unit": "unknown"}):
+        columns = ("TEMPERATURE", "D", MAP, silent), ("N_OBS", "D", MAP, {})
+        path = written(tmp_path / f"{len(silent)}.fits", *columns, **{keyword: "mK"})
+        np.testing.assert_allclose(healpix.read_uk(path, "ecliptic", None), 1e3 * MAP)
+        assert healpix.read_map(path, healpix.HITS)[2] is None
 
 
 def test_a_lack_of_memory_is_not_a_broken_file(tmp_path, monkeypatch) -> None:

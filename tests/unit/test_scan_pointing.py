@@ -6,6 +6,7 @@ import pytest
 from numba import njit
 from scipy.spatial.transform import Rotation
 
+from mcsim.instrument.scan import Moments
 from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.instrument.scan.model import LineOfSight, ScanModel
 from mcsim.instrument.scan.pointing import pointing, quarter_turns, ring_pixel
@@ -144,3 +145,8 @@ def test_frames_and_resolutions_are_checked():
     for npix in (0, 13, 12 * 9):
         with refused("map", npix):
             nside_of(npix, "map")
+
+
+def test_user_pointing_may_tell_of_latitudes_beside_the_names_of_its_columns(tmp_path):
+    np.savetxt(tmp_path / "p.txt", np.full((3, 3), 0.1), header="made at elevation 40, any azimuth\ntheta phi psi")
+    assert Moments.from_pointing_files(tmp_path / "p.txt", 8, 1).hits.sum() == 3.0

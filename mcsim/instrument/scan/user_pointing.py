@@ -105,9 +105,11 @@ def _columns(path: Path, frame: str) -> tuple[list[Any], list[float]]:
 def _check_header(path: Path) -> None:
     """Raise ValueError if the first lines of a text file name other columns or degrees."""
     with path.open(encoding="utf-8-sig") as stream:
-        for line in takewhile(lambda line: line.startswith("#"), map(str.lstrip, stream)):
+        lines = list(takewhile(lambda line: line.startswith("#"), map(str.lstrip, stream)))
+        named = any(set(_NAMES) <= set(re.findall(r"theta|phi|psi", line.lower())) for line in lines)
+        for line in lines:
             names = re.findall(r"theta|phi|psi|time", line.lower())
-            if not set(_NAMES) <= set(names) and all(word.search(line) for word in _LATITUDE_AND_LONGITUDE):
+            if not named and all(word.search(line) for word in _LATITUDE_AND_LONGITUDE):
                 raise ValueError(f"it says {line.strip()[:60]!r}: give colatitude theta, phi and psi, in this order")
             if set(_NAMES) <= set(names) and tuple(names[:3]) != _NAMES:
                 raise ValueError(f"its columns are named {', '.join(names)}: give theta, phi, psi, time, in this order")
