@@ -52,7 +52,7 @@ def figure(channel: ChannelResult) -> Figure:
     a, b, explained, seen = (one[first] for one in (channel.a, channel.b, channel.explained, channel.seen))
     difference = b - a
     for key, title, values, signed in (
-        ("a", f"A: {channel.splits[first].replace(':', ' ')}", a, False),
+        ("a", f"A, {channel.splits[first]}", a, False),
         ("b", "B", b, False),
         ("c", "B − A", difference, True),
         ("d", "explained", explained, True),
