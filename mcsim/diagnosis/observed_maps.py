@@ -214,7 +214,7 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         said = []
         for number, pixel, size in outstanding(maps, len(self.context.ensemble.bipolar_scan), STANDS_OUT):
             lon, lat = (round(float(angle)) for angle in healpy.pix2ang(nside, pixel, lonlat=True))
-            where = f"longitude {lon}°, latitude {lat}° ({model.frame})".replace("-", "−")
+            where = f"longitude {lon % 360}°, latitude {lat}° ({model.frame})".replace("-", "−")
             said.append(
                 f"One place of the residual of {model.parts[number].name} stands out, {size:.0f} times its scatter: "
                 f"{where}. Glitches, sources and the Galaxy look so, and effects on beam, gain or noise do not: leave "
