@@ -74,7 +74,7 @@ def test_names_with_the_signs_of_mathematics_are_drawn_as_they_are() -> None:
     )
     picture = report.figure(found)
     picture.draw_without_rendering()
-    assert "A: a$_$b" in picture.axes[0].get_title()
+    assert "A, a$_$b" in picture.axes[0].get_title()
 
 
 @pytest.mark.parametrize(
