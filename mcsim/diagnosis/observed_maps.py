@@ -217,8 +217,8 @@ class ObservedMaps(DataSet[Sequence[Map]]):
             where = f"longitude {lon % 360}°, latitude {lat}° ({model.frame})".replace("-", "−")
             said.append(
                 f"One place of the residual of {model.parts[number].name} stands out, {size:.0f} times its scatter: "
-                f"{where}. Glitches, sources and the Galaxy look so, and effects on beam, gain or noise do not: leave "
-                "its pixels out and diagnose the maps again."
+                f"{where}. Glitches, sources and the Galaxy look so, and hardly an effect on beam, gain or noise does: "
+                "leave its pixels out and diagnose the maps again."
             )
         return said
 
