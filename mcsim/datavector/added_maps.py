@@ -29,9 +29,13 @@ class AddedMaps:
 
     def run_of(self, found: Sequence[config.Effect]) -> Added:
         """Return the run with those effects that add to maps; "" if little of what they add is taken for sky."""
+        run = self.whole_run(found)
+        return run if run and self._share(run) > TAKEN else ""
+
+    def whole_run(self, found: Sequence[config.Effect]) -> Added:
+        """Return the run with those effects that can add to maps, however little; "" if none can."""
         own = [one for one in found if self._adds(one)]
-        run = config.to_json(with_effects(self.analysis.run, own)) if own else ""
-        return run if own and self._share(run) > TAKEN else ""
+        return config.to_json(with_effects(self.analysis.run, own)) if own else ""
 
     def less(self, maps: Sequence[Map], run: Added) -> list[Map]:
         """Return maps, uK, shape (npix,) each, without what the effects of a run add to them."""

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import healpy
 import numpy as np
 from scipy import stats
 
@@ -10,6 +11,7 @@ from mcsim.datavector.summaries import Element
 from mcsim.stats.look_elsewhere import deviations, scan_pvalues
 from mcsim.support.arrays import Map, Matrix, Vector
 
+NEAR, NEAR_DEG = 0.8, 20.0  #: share that a place which stands out must reach over the pixels up to that distance
 FOLDS = 20  #: parts of the simulations, at most, each of which is compared with all others
 
 
@@ -86,20 +88,36 @@ def standardised(x: Map, mean: Map, scatter: Map, count: int) -> Map:
     return np.where(seen, (x - mean) / np.where(seen, scatter, 1.0) / scale, np.nan)
 
 
-def outstanding(maps: Matrix, count: int, level: float) -> list[tuple[int, int, float]]:
-    """Return map, pixel and size of what stands out of each standardised residual map, (map, npix), that has such.
+def outstanding(maps: Matrix, count: int, level: float) -> dict[int, dict[int, float]]:
+    """Return pixels and sizes, the largest first, of what stands out of each standardised residual map, (map, npix).
 
-    It is the largest residual of a map over the scatter of that map, which what acts everywhere widens, if pixels that
-    are independent have one as large with a probability of at most ``level`` by chance. ``count`` > 3 simulations told
-    their scatter: the deviates are those of Student's t.
+    A residual counts over the scatter of its map, which what acts everywhere widens, if pixels that are independent
+    have one as large with a probability of at most ``level`` by chance; a share ``NEAR`` of that is asked for over the
+    scatter of the pixels near it, which uneven noise widens. ``count`` > 3 simulations told the scatter of pixels: the
+    deviates are those of Student's t. Maps of which nothing stands out are left out.
     """
-    found = []
+    chance = level / max(int(np.isfinite(maps).sum()), 1)
+    least = float(stats.t.isf(chance / 2.0, count - 1)) / np.sqrt((count - 1.0) / (count - 3.0))
+    found = {}
     for number, one in enumerate(maps):
-        distance = np.abs(one - np.nanmedian(one)) if np.isfinite(one).any() else np.zeros(1)
-        scatter = float(np.nanmedian(distance)) / stats.norm.ppf(0.75)
-        pixel = int(np.nanargmax(distance))
-        size = float(distance[pixel]) / scatter if scatter > 0.0 else 0.0
-        chance = 2.0 * stats.t.sf(size * np.sqrt((count - 1.0) / (count - 3.0)), count - 1)
-        if chance * int(np.isfinite(maps).sum()) <= level:
-            found.append((number, pixel, size))
+        if not np.isfinite(one).any():
+            continue
+        distance = np.abs(one - np.nanmedian(one))
+        size = distance / _scatter(distance)
+        places = [int(pixel) for pixel in np.argsort(-size) if size[pixel] >= least]  # a NaN is not
+        if near := {pixel: float(size[pixel]) for pixel in places if _over_near(distance, pixel) >= NEAR * least}:
+            found[number] = near
     return found
+
+
+def _scatter(distance: Vector) -> float:
+    """Return the scatter of which the median distance from the median is that of a Gaussian; infinite for 0."""
+    median = float(np.nanmedian(distance))
+    return median / float(stats.norm.ppf(0.75)) if median > 0.0 else np.inf
+
+
+def _over_near(distance: Vector, pixel: int) -> float:
+    """Return a distance over the scatter of the pixels around it."""
+    nside = healpy.npix2nside(len(distance))
+    near = healpy.query_disc(nside, healpy.pix2vec(nside, pixel), np.deg2rad(NEAR_DEG))
+    return float(distance[pixel]) / _scatter(distance[near])

@@ -97,6 +97,10 @@ class SameSkies:
     def _added(self) -> AddedMaps:
         return AddedMaps(self.analysis)
 
+    def less_added(self, found: Sequence[config.Effect]) -> list[Map]:
+        """Return the observed maps, uK, without what effects add to them, whatever their sky."""
+        return self._added.less(self.maps, self._added.whole_run(found))
+
     @cached_property
     def _skies(self) -> Callable[[Seen], Alm]:
         return cache(self._sky)

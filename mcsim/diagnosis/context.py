@@ -208,6 +208,10 @@ class DataSet(ABC, Generic[Data]):
         """Return sentences on orders of the maps in which the model fits, if it does not in that of the data."""
         return []
 
+    def stands_out_beside(self, found: Sequence[config.Effect]) -> bool:
+        """Return True if places of maps stand out that are not what effects add to them."""
+        return False
+
     def notes(self) -> list[str]:
         """Return sentences on the data."""
         return []

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mcsim.datavector.candidate import Candidate, parts_of
+from mcsim import config
+from mcsim.datavector.candidate import Candidate, parts_of, tables_at
 from mcsim.diagnosis.consistency import Action, Slices, contradiction
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import is_drawn
@@ -20,6 +21,7 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
 
     The effects of a set are simulated at their amplitudes, and these are compared in parts of the data. An effect whose
     pattern on the sky is drawn has no such response: it is told from other signals on the sky by its frequencies alone.
+    No set is named beside places of the residual maps that stand out and are not what it adds to the maps.
     Where another set agrees, one that parts contradict is not left out before it is ``odds_cut`` times less probable.
     What is left has to be as probable as ``named_probability`` asks for without what was left out.
     """
@@ -34,6 +36,11 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
     sentences: list[str] = []
     for one in found.explanations:
         members = [candidates[member] for member in one.members]
+        if _leaves_places(data, one):
+            refused.append(one)
+            why = "places of the residual maps stand out, and are not what it adds to them"
+            sentences.append(f"The data vector fits {_title(candidates, one)}, which is not named: {why}.")
+            continue
         if any(map(is_drawn, members)):
             if len(frequencies) == 1:
                 refused.append(one)
@@ -64,6 +71,14 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
         sentences.append(f"The data vector fits {sets}, which is not named: {why}.")
         left = replace(left.unexplained(), contradicted=(*refused, *left.explanations))
     return left, sentences
+
+
+def _leaves_places(data: DataSet, one: Explanation) -> bool:
+    """Return True if places of the residual maps stand out that are not what a set adds to the maps."""
+    acting: list[config.Effect] = []
+    with if_possible():
+        acting = tables_at(data.context.candidates, one.members, one.fit)
+    return data.stands_out_beside(acting)
 
 
 def _is_as_probable(one: Explanation, agreed: Sequence[Explanation], cut: float) -> bool:

@@ -9,17 +9,24 @@ import healpy
 import numpy as np
 
 from mcsim import config
+from mcsim.datavector.bipolar_scan import coarse_residuals
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.localisation import Place, outstanding, places, standardised
 from mcsim.datavector.map_checks import exchanges, share_left_out
 from mcsim.datavector.nuisances import half_given_other
 from mcsim.datavector.same_skies import SameSkies, Skies
+from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.output import DIGEST, digest
 from mcsim.support.arrays import Map, Matrix, Vector
 from mcsim.systematics import if_possible
 
 STANDS_OUT = 1e-6  #: probability up to which what stands out of a residual map is no chance
+PLACES = 5  #: of a map that a sentence has room for
+MASK_THEM = (
+    "Glitches, sources and the Galaxy look so, and no effect on beam, gain or noise does: "
+    "leave these pixels out and diagnose the maps again."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,24 +210,37 @@ class ObservedMaps(DataSet[Sequence[Map]]):
 
     def residual_maps(self) -> Matrix:
         """Return the residual maps over the scatter of those of simulations, shape (map, npix)."""
+        return self._standardised(self._measured[2])
+
+    def _standardised(self, coarse: Map) -> Matrix:
         ensemble = self.context.ensemble
         drawn = len(ensemble.bipolar_scan)
-        return standardised(self._measured[2], ensemble.residual_mean, ensemble.residual_scatter, drawn)
+        return standardised(coarse, ensemble.residual_mean, ensemble.residual_scatter, drawn)
+
+    def _outstanding(self, maps: Matrix) -> dict[int, dict[int, float]]:
+        return outstanding(maps, len(self.context.ensemble.bipolar_scan), STANDS_OUT)
+
+    def stands_out_beside(self, found: Sequence[config.Effect]) -> bool:
+        """Return True if places of the residual maps stand out that are not what effects add to the maps."""
+        if not self._outstanding(self.residual_maps()):
+            return False
+        model = self.context.analysis.model
+        filtered = wiener_filter(model, self.same_skies.less_added(found))
+        return bool(self._outstanding(self._standardised(coarse_residuals(model, filtered))))
 
     def notes(self) -> list[str]:
-        """Return a sentence on each map of whose residual one place stands out as hardly any effect lets it."""
-        maps, model = self.residual_maps(), self.context.analysis.model
-        nside = healpy.npix2nside(maps.shape[1])
-        said = []
-        for number, pixel, size in outstanding(maps, len(self.context.ensemble.bipolar_scan), STANDS_OUT):
-            lon, lat = (round(float(angle)) for angle in healpy.pix2ang(nside, pixel, lonlat=True))
-            where = f"longitude {lon % 360}°, latitude {lat}° ({model.frame})".replace("-", "−")
-            said.append(
-                f"One place of the residual of {model.parts[number].name} stands out, {size:.0f} times its scatter: "
-                f"{where}. Glitches, sources and the Galaxy look so, and hardly an effect on beam, gain or noise does: "
-                "leave its pixels out and diagnose the maps again."
-            )
-        return said
+        """Return a sentence on each map of whose residual places stand out as no effect lets them, and a remedy."""
+        maps, model, said = self.residual_maps(), self.context.analysis.model, list[str]()
+        for number, sizes in self._outstanding(maps).items():
+            each = [healpy.pix2ang(healpy.npix2nside(maps.shape[1]), pixel, lonlat=True) for pixel in sizes]
+            where = [f"longitude {round(lon) % 360}°, latitude {round(lat)}°".replace("-", "−") for lon, lat in each]
+            where[PLACES:] = [f"{len(where) - PLACES} more"] * (len(where) > PLACES)
+            name, size = model.parts[number].name, f"{max(sizes.values()):.0f} times its scatter"
+            start = f"One place of the residual of {name} stands out, {size}"
+            if len(sizes) > 1:
+                start = f"{len(sizes)} places of the residual of {name} stand out, up to {size}"
+            said.append(f"{start}: {'; '.join(where)} ({model.frame}).")
+        return [*said, MASK_THEM] if said else []
 
     def provenance(self) -> dict[str, str | int]:
         """Return the hash of the maps."""

@@ -73,19 +73,6 @@ def test_no_gap_where_there_is_none(small):
     assert found.verdict["effects"] == []
 
 
-def test_a_place_that_stands_out_of_a_residual_map_is_said(small):
-    """Ten bad pixels of one map were called a narrower beam, or point sources, without a word of where they are."""
-    shared, pixel = data_of(small.run), 1000
-    assert not any(ObservedMaps(small, list(simulate.maps(shared, r)), ask).notes() for r in range(12))
-    changed = [map_uk.copy() for map_uk in simulate.maps(shared, 3)]
-    changed[2][pixel] += 30.0 * shared.maps[2].noise_uk[pixel]
-    (said,) = ObservedMaps(small, changed, ask).notes()
-    lon, lat = healpy.pix2ang(small.run.map.nside, pixel, lonlat=True)
-    assert shared.map_names[2] in said
-    assert f"longitude {lon:.0f}°" in said
-    assert f"latitude {lat:.0f}°".replace("-", "−") in said
-
-
 def test_ellipticity_seen_sample_by_sample_is_named_and_shrinks(small, tmp_path):
     truth = 0.25
     shared = data_of(small.run, "beam_ellipticity", "W1", amplitude=truth, angle_deg=20.0)

@@ -14,6 +14,11 @@ from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.stats.gaussian import Fit
 
 
+def data_of(context):
+    """Return data of which no place stands out."""
+    return SimpleNamespace(context=context, stands_out_beside=lambda found: False)
+
+
 def test_a_set_behind_others_that_parts_contradict_is_compared_too(monkeypatch):
     """Only so many agreeing sets are compared; those that fall away do not count."""
     settings, compared = DiagnosisSettings(), []
@@ -31,7 +36,7 @@ def test_a_set_behind_others_that_parts_contradict_is_compared_too(monkeypatch):
     monkeypatch.setattr(naming, "slices_of", lambda data: SimpleNamespace(findings=findings))
     monkeypatch.setattr(naming, "_actions", lambda *_: [])
     context = SimpleNamespace(settings=settings, candidates=candidates, run=SimpleNamespace(channels=[]))
-    agreed, sentences = naming.agreeing(SimpleNamespace(context=context), None, found)
+    agreed, sentences = naming.agreeing(data_of(context), None, found)
     assert compared == list("ABCDEF")
     assert agreed.verdict == "unknown"
     assert len(sentences) == len(each)
@@ -48,7 +53,7 @@ def of_two(monkeypatch, odds, probability, pvalue):
     monkeypatch.setattr(naming, "slices_of", lambda data: SimpleNamespace(findings=lambda *_: next(results)))
     monkeypatch.setattr(naming, "_actions", lambda *_: [])
     context = SimpleNamespace(settings=DiagnosisSettings(), candidates=candidates, run=SimpleNamespace(channels=[]))
-    return *naming.agreeing(SimpleNamespace(context=context), None, found), bad
+    return *naming.agreeing(data_of(context), None, found), bad
 
 
 @pytest.mark.parametrize(("odds", "verdict"), [(1e-3, "effect"), (1e-5, "unknown")])

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 from typing import Any
 
+import healpy
 import numpy as np
 import pytest
 
@@ -67,6 +68,10 @@ def test_a_glitch_stands_out_of_its_map_and_what_acts_everywhere_does_not():
     glitch = drawn[2, 0] + 12.0 * (np.arange(npix) == 1234)
     hole = np.where(np.arange(npix) < 100, np.nan, glitch)
     nothing = np.full(npix, np.nan)
-    found = outstanding(np.stack([noisy, glitch, dipole, hole, nothing]), count, 1e-6)
-    assert [(number, pixel) for number, pixel, _ in found] == [(1, 1234), (3, 1234)]
-    assert all(size == pytest.approx(12.0, abs=4.0) for _, _, size in found)
+    uneven = drawn[3, 0] * (1.0 + 4.0 * healpy.pix2vec(16, np.arange(npix))[2] ** 8)
+    two = glitch - 30.0 * (np.arange(npix) == 1000)
+    found = outstanding(np.stack([noisy, glitch, dipole, hole, nothing, uneven, two]), count, 1e-6)
+    assert np.abs(uneven).max() > 9.0
+    assert {number: list(sizes) for number, sizes in found.items()} == {1: [1234], 3: [1234], 6: [1000, 1234]}
+    assert found[1][1234] == pytest.approx(12.0, abs=4.0)
+    assert found[6][1000] == pytest.approx(30.0, abs=4.0)
