@@ -30,7 +30,7 @@ from mcsim.simulation.channels import with_all_orders
 from mcsim.simulation.noise import of_map
 from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import header, healpix
+from mcsim.sphere import header, map_files
 from mcsim.sphere.checks import UNSEEN_BELOW, check_map, check_not_infinite
 from mcsim.support import resources
 from mcsim.support.arrays import Alm, Map, reals
@@ -352,7 +352,7 @@ def _folder(folder: Path, run: config.RunConfig | None, described: str) -> dict[
         raise InputError(f"{folder} holds no map to compare; give {expected}.")
     found = {}
     for name, path in names.items():
-        map_, frame, unit = healpix.read_map(path)
+        map_, frame, unit = map_files.read_map(path, any_order=True)
         if run is not None and frame not in (None, config.prepared_grid(run)[1]):
             raise InputError(
                 f"{path} is in {frame} coordinates, the model {described} in {config.prepared_grid(run)[1]}; set its "

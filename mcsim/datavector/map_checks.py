@@ -17,7 +17,8 @@ from mcsim.ensemble.maps import POINTING, file_names, first_realization
 from mcsim.errors import InputError
 from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.sphere.header import first_table, opened
-from mcsim.sphere.healpix import read_uk
+from mcsim.sphere.map_files import read_uk
+from mcsim.sphere.pixel_order import check_ring
 from mcsim.support.arrays import Map
 from mcsim.support.folders import user_path
 from mcsim.support.numbers import some
@@ -44,6 +45,7 @@ def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
             f"{name} is exactly 0 in {zeros} pixels that the model observes; mark what was not observed as UNSEEN, and "
             "give the model a mask (map.mask) that leaves it out too."
         )
+    check_ring(map_, name)
     rms = float(np.std(seen))
     if rms == 0.0:
         raise InputError(f"{name} is constant; give an observed map.")

@@ -19,7 +19,7 @@ from mcsim.config import arrays
 from mcsim.errors import InputError
 from mcsim.sphere import header
 from mcsim.sphere.checks import UNSEEN_BELOW
-from mcsim.sphere.healpix import read_uk
+from mcsim.sphere.map_files import read_uk
 from mcsim.support.arrays import Alm, Map, reals
 from mcsim.support.folders import unreadable
 from mcsim.support.loading import once_per_content

@@ -17,7 +17,7 @@ from mcsim.simulation.preparation import preparation
 from mcsim.sphere import spectra
 from mcsim.sphere.checks import UNSEEN_BELOW, check_map, check_not_infinite
 from mcsim.sphere.header import first_table, opened
-from mcsim.sphere.healpix import read_uk
+from mcsim.sphere.map_files import read_uk
 from mcsim.support.arrays import Map, reals
 from mcsim.support.folders import appearing, not_filled, unwritable, user_path, writable
 

@@ -16,7 +16,7 @@ from mcsim.errors import InputError
 from mcsim.instrument.scan import MapGrid, Moments
 from mcsim.simulation import timestream
 from mcsim.simulation.channels import scan_model
-from mcsim.sphere import header, healpix
+from mcsim.sphere import header, map_files
 from mcsim.sphere.checks import UNSEEN_BELOW, check_not_infinite
 from mcsim.sphere.mask import kept_mask
 from mcsim.support.arrays import Map, divided
@@ -86,7 +86,7 @@ def of_map(
     noise = spec.noise_of(split)
     if isinstance(noise, declared.Noise) and noise.hits is not None:
         path = config.channel_path(noise.hits, spec.name, split)
-        moments = replace(moments, hits=np.where(moments.hits > 0, _positive(path, moments, healpix.HITS)[0], 0.0))
+        moments = replace(moments, hits=np.where(moments.hits > 0, _positive(path, moments, map_files.HITS)[0], 0.0))
     if declared.is_noise_free(noise):
         return moments, None, None
     observed = moments.hits > 0
@@ -98,7 +98,7 @@ def of_map(
             return moments, np.where(observed, noise.depth_uk_arcmin / side, 0.0), None
         case declared.NoiseVariance():
             path = config.channel_path(noise.variance, spec.name, split)
-            variance, unit = _positive(path, moments, healpix.VARIANCE)
+            variance, unit = _positive(path, moments, map_files.VARIANCE)
             variance = header.to_uk2(unit, path, spec.frequency_ghz) * variance
             moments = replace(moments, hits=np.where(variance > 0.0, moments.hits, 0.0))
             return moments, np.where(moments.hits > 0, np.sqrt(variance), 0.0), None
@@ -181,7 +181,7 @@ def _difference(
         hits = np.isfinite(maps).astype(np.float64)
     else:
         given = [config.channel_path(path, spec.name) for path in noise.hits] or paths
-        hits = np.stack([_positive(path, moments, healpix.HITS, bool(noise.hits))[0] for path in given])
+        hits = np.stack([_positive(path, moments, map_files.HITS, bool(noise.hits))[0] for path in given])
     used = np.all(np.isfinite(maps) & (hits > 0.0), axis=0)
     if noise.mask is not None:
         mask = kept_mask(config.channel_path(noise.mask, spec.name), moments.nside, moments.frame, run.map.mask_frame)
@@ -246,7 +246,7 @@ def _noise_map(path: Path, moments: Moments, frequency_ghz: float | None) -> Map
 
 def _temperature(path: Path, moments: Moments, frequency_ghz: float | None) -> Map:
     """Return a map in uK, NaN where nothing was observed."""
-    values = healpix.read_uk(path, moments.frame, frequency_ghz)
+    values = map_files.read_uk(path, moments.frame, frequency_ghz)
     _check_nside(values, path, moments)
     return np.where(np.isfinite(values) & (values > UNSEEN_BELOW), values, np.nan)
 
@@ -256,15 +256,15 @@ def _positive(path: Path, moments: Moments, names: Sequence[str], alone: bool = 
 
     ``alone``: a file with a single column holds it, whatever it is called.
     """
-    others = healpix.VARIANCE if names is healpix.HITS else (*healpix.HITS, *healpix.WEIGHT)
-    other = (*healpix.POLARISATION, *healpix.DEVIATION, *others)
-    values, _, unit = healpix.read_map(path, tuple(names), moments.frame, alone=alone, other=other)
+    others = map_files.VARIANCE if names is map_files.HITS else (*map_files.HITS, *map_files.WEIGHT)
+    other = (*map_files.POLARISATION, *map_files.DEVIATION, *others)
+    values, _, unit = map_files.read_map(path, tuple(names), moments.frame, alone=alone, other=other)
     _check_nside(values, path, moments)
-    if names is healpix.HITS:
+    if names is map_files.HITS:
         header.refuse_temperature(unit, path, "the number of observations")
         check_not_infinite(values, str(path))  # an infinite variance is that of a pixel that was not observed
     values = np.where(np.isfinite(values) & (values > UNSEEN_BELOW), values, 0.0)
-    if unit is None and names is healpix.VARIANCE and 0.0 < values.max() < SMALLEST_UK2:
+    if unit is None and names is map_files.VARIANCE and 0.0 < values.max() < SMALLEST_UK2:
         raise InputError(
             f"{path} has variances of at most {values.max():.3g} uK^2, less than any map's ({SMALLEST_UK2:g} uK^2); "
             "are they in K^2? Say the unit in its header (TUNIT), or give them in uK^2."

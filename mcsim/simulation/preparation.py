@@ -20,7 +20,7 @@ from mcsim.instrument.beams import Beam, read_window
 from mcsim.instrument.scan import Moments
 from mcsim.simulation.channels import load_beam
 from mcsim.simulation.steps import NEGLIGIBLE, Average, Filled, Filter, Regression, Rotated, Step, Weighted
-from mcsim.sphere import healpix, rotation
+from mcsim.sphere import healpix, map_files, rotation
 from mcsim.sphere.checks import UNSEEN_BELOW, check_complete, check_map
 from mcsim.sphere.mask import kept_mask
 from mcsim.support.arrays import Map
@@ -352,7 +352,7 @@ def _harmonics(nside: int, monopole: bool, dipole: bool) -> NDArray[np.float64]:
 
 def _template(path: Path, nside: int, frame: str, spec: config.Channel) -> Map:
     """Read a template in uK, at the nside and in the frame of the maps that it is taken off."""
-    template = healpix.read_uk(path, frame, spec.frequency_ghz)
+    template = map_files.read_uk(path, frame, spec.frequency_ghz)
     check_map(template, nside, f"template {path}")
     check_complete(template, f"template {path}")
     return template

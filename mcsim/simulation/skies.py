@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import header, healpix
+from mcsim.sphere import header, healpix, map_files
 from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.support.arrays import Alm
 from mcsim.support.npy import read_npy
@@ -67,7 +67,7 @@ def read_map(path: Path, lmax: int, frame: str, frequency_ghz: float | None = No
     ``frame`` is the run's, and the file's where it states one; ``frequency_ghz`` is what the run's channels have in
     common: antenna temperature and brightness need it. InputError if the file cannot be used so.
     """
-    map_uk, stated = healpix.read_uk_and_unit(path, frame, frequency_ghz)
+    map_uk, stated = map_files.read_uk_and_unit(path, frame, frequency_ghz)
     nside = healpy.npix2nside(map_uk.size)
     if nside & (nside - 1):
         raise InputError(f"{path} has nside {nside}, which is not a power of two; bring the sky to one that is.")

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mcsim.errors import InputError
-from mcsim.sphere import healpix, rotation
+from mcsim.sphere import map_files, rotation
 from mcsim.sphere.checks import check_map, check_nside
 from mcsim.support.loading import once_per_content
 
@@ -33,7 +33,7 @@ def read_mask(
     resolutions. The edge is apodised last: its width does not depend on the file's resolution.
     """
     check_nside(nside)
-    mask, stated, _ = healpix.read_map(path, bad=0.0)
+    mask, stated, _ = map_files.read_map(path, bad=0.0)
     found = healpy.get_nside(mask)
     if found & (found - 1):
         raise InputError(f"{path} has nside {found}, which is not a power of two; bring the mask to one that is.")

@@ -9,7 +9,7 @@ import numpy as np
 
 from mcsim.errors import InputError
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import healpix
+from mcsim.sphere import healpix, map_files
 from mcsim.sphere.checks import check_complete
 from mcsim.sphere.header import to_uk
 from mcsim.sphere.rotation import rotate_alm
@@ -43,7 +43,7 @@ def template_alm(path: str, lmax: int, frame: str, in_uk: bool = False, frequenc
 
     They are in the unit of the file; ``in_uk``: in uK, by the unit that the header states, at a channel's frequency.
     """
-    values, found, unit = healpix.read_map(Path(path))
+    values, found, unit = map_files.read_map(Path(path))
     check_complete(values, path)
     if not np.any(values):
         raise InputError(f"{path} is zero in every pixel; give a complete template.")

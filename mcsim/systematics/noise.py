@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.errors import InputError
-from mcsim.sphere import healpix
+from mcsim.sphere import healpix, map_files
 from mcsim.sphere.checks import check_complete
 from mcsim.sphere.rotation import rotation_matrix
 from mcsim.systematics.base import Bound, Effect, Map, Site, Wording
@@ -111,7 +111,7 @@ class NoiseKnee(Effect):
 
 def _of_file(path: str, frame: str, centres: NDArray[np.float64]) -> Map:
     """Return a template at these directions in ``frame``."""
-    values, found, _ = healpix.read_map(Path(path))
+    values, found, _ = map_files.read_map(Path(path))
     check_complete(values, path)
     seen = rotation_matrix(frame, found or frame) @ centres
     return np.asarray(values[healpy.vec2pix(healpy.npix2nside(values.size), *seen)])

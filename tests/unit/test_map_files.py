@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from mcsim.sphere import healpix
+from mcsim.sphere import map_files
 from refusals import refused
 
 NSIDE = 4
@@ -28,7 +28,7 @@ def written(path, *columns, primary=(), **keywords) -> Path:
 def test_the_order_is_read_in_any_case(tmp_path, order: str) -> None:
     nested = healpy.reorder(MAP, r2n=True)
     path = written(tmp_path / "nested.fits", ("TEMPERATURE", "D", nested, {}), ORDERING=order)
-    np.testing.assert_array_equal(healpix.read_map(path)[0], MAP)
+    np.testing.assert_array_equal(map_files.read_map(path)[0], MAP)
 
 
 @pytest.mark.parametrize("stated", [{"INDXSCHM": "explicit"}, {"OBJECT": "PARTIAL"}, {"INDXSCHM": "IMPLICIT"}, {}])
@@ -36,7 +36,7 @@ def test_the_order_is_read_in_any_case(tmp_path, order: str) -> None:
 def test_pixel_numbers_are_no_temperatures(tmp_path, stated: dict, reverse: bool) -> None:
     columns = [("PIXEL", "J", SOME, {}), ("SIGNAL", "E", MAP[SOME], {"unit": "mK"}), ("Q", "E", SOME, {"unit": "K"})]
     made = [columns[1], columns[0], columns[2]] if reverse else columns
-    found, _, unit = healpix.read_map(written(tmp_path / "some.fits", *made, **stated))
+    found, _, unit = map_files.read_map(written(tmp_path / "some.fits", *made, **stated))
     expected = np.full(MAP.size, healpy.UNSEEN)
     expected[SOME] = MAP[SOME].astype(np.float32)
     np.testing.assert_array_equal(found, expected)
@@ -54,19 +54,19 @@ def test_pixel_numbers_are_no_temperatures(tmp_path, stated: dict, reverse: bool
 def test_pixel_numbers_that_are_none(tmp_path, pixels: np.ndarray, named: tuple) -> None:
     path = written(tmp_path / "some.fits", ("PIXEL", "J", pixels, {}), ("SIGNAL", "D", MAP[SOME], {}))
     with refused(path, *named):
-        healpix.read_map(path)
+        map_files.read_map(path)
 
 
 def test_a_null_of_integers_is_not_observed(tmp_path) -> None:
     counts, expected = np.arange(192) % 7, np.arange(192.0) % 7
     counts[5], expected[5] = -99, healpy.UNSEEN
     path = written(tmp_path / "null.fits", ("N_OBS", "J", counts, {"null": -99}))
-    np.testing.assert_array_equal(healpix.read_map(path)[0], expected)
+    np.testing.assert_array_equal(map_files.read_map(path)[0], expected)
 
 
 def test_bad_data_of_the_primary_header(tmp_path) -> None:
     path = written(tmp_path / "bad.fits", ("TEMPERATURE", "D", MAP, {}), primary={"BAD_DATA": MAP[7]})
-    found = healpix.read_map(path)[0]
+    found = map_files.read_map(path)[0]
     assert found[7] == healpy.UNSEEN
     np.testing.assert_array_equal(np.delete(found, 7), np.delete(MAP, 7))
 
@@ -74,10 +74,10 @@ def test_bad_data_of_the_primary_header(tmp_path) -> None:
 def test_a_table_of_other_pixels_than_its_header_says(tmp_path) -> None:
     path = written(tmp_path / "few.fits", ("TEMPERATURE", "D", MAP[:100], {}))
     with refused(path, "NSIDE", 4, 192, 100):
-        healpix.read_map(path)
+        map_files.read_map(path)
     path = written(tmp_path / "complex.fits", ("TEMPERATURE", "M", MAP + 1j, {}))
     with refused(path, "TEMPERATURE"):
-        healpix.read_map(path)
+        map_files.read_map(path)
 
 
 @pytest.mark.parametrize("keyword", ["BUNIT", "UNITS"])
@@ -85,8 +85,8 @@ def test_a_unit_of_the_whole_table_is_that_of_temperatures(tmp_path, keyword: st
     for silent in ({}, {"unit": "unknown"}):
         columns = ("TEMPERATURE", "D", MAP, silent), ("N_OBS", "D", MAP, {})
         path = written(tmp_path / f"{len(silent)}.fits", *columns, **{keyword: "mK"})
-        np.testing.assert_allclose(healpix.read_uk(path, "ecliptic", None), 1e3 * MAP)
-        assert healpix.read_map(path, healpix.HITS)[2] is None
+        np.testing.assert_allclose(map_files.read_uk(path, "ecliptic", None), 1e3 * MAP)
+        assert map_files.read_map(path, map_files.HITS)[2] is None
 
 
 def test_a_lack_of_memory_is_not_a_broken_file(tmp_path, monkeypatch) -> None:
@@ -94,6 +94,6 @@ def test_a_lack_of_memory_is_not_a_broken_file(tmp_path, monkeypatch) -> None:
         raise MemoryError
 
     path = written(tmp_path / "map.fits", ("TEMPERATURE", "D", MAP, {}))
-    monkeypatch.setattr(healpix, "_in_ring_order", lacking)
+    monkeypatch.setattr(map_files, "_in_ring_order", lacking)
     with pytest.raises(MemoryError):
-        healpix.read_map(path)
+        map_files.read_map(path)

@@ -19,7 +19,7 @@ from mcsim.instrument.scan.pointing import pointing
 from mcsim.instrument.scan.user_pointing import blocks_of_files
 from mcsim.simulation import convolve, rings, skies, tod
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import header, healpix, mask, rng, rotation, sky
+from mcsim.sphere import header, healpix, map_files, mask, rng, rotation, sky
 from refusals import refused
 
 LMAX, NSIDE = 16, 8
@@ -268,10 +268,10 @@ def write_map(path: Path, values: np.ndarray = MAP, **keywords: object) -> Path:
 def test_maps_of_both_orders_and_explicit_pixels(tmp_path):
     nested = tmp_path / "nested.fits"
     healpy.write_map(nested, healpy.reorder(MAP, r2n=True), nest=True, dtype=np.float64)
-    np.testing.assert_array_equal(healpix.read_map(nested)[0], MAP)
+    np.testing.assert_array_equal(map_files.read_map(nested)[0], MAP)
     partial = tmp_path / "partial.fits"
     healpy.write_map(partial, UNSEEN, partial=True, dtype=np.float64, column_units="mK", coord="G")
-    found, frame, unit = healpix.read_map(partial)
+    found, frame, unit = map_files.read_map(partial)
     np.testing.assert_array_equal(found, UNSEEN)
     assert (frame, unit) == ("galactic", "mK")
 
@@ -279,19 +279,19 @@ def test_maps_of_both_orders_and_explicit_pixels(tmp_path):
 @pytest.mark.parametrize("keywords", [{"ORDERING": None}, {"ORDERING": "UPWARDS"}, {"COORDSYS": "X"}])
 def test_maps_that_do_not_say_what_they_are(tmp_path, keywords):
     with refused(next(iter(keywords))):
-        healpix.read_map(write_map(tmp_path / "map.fits", **keywords))
+        map_files.read_map(write_map(tmp_path / "map.fits", **keywords))
 
 
 def test_a_frame_may_stand_in_the_primary_header(tmp_path):
     """It was passed over: a galactic map or pointing was taken for that of the run."""
     path = write_map(tmp_path / "map.fits", COORDSYS=None)
     fits.setval(path, "COORDSYS", value="G", ext=0)
-    assert healpix.read_map(path)[1] == "galactic"
+    assert map_files.read_map(path)[1] == "galactic"
     with refused("galactic", "ecliptic"):
-        healpix.read_map(path, frame="ecliptic")
+        map_files.read_map(path, frame="ecliptic")
     fits.setval(path, "COORDSYS", value="E", ext=1)
     with refused("galactic", "ecliptic", "primary"):
-        healpix.read_map(path)
+        map_files.read_map(path)
     alm, samples = tmp_path / "alm.fits", tmp_path / "samples.fits"
     healpy.write_alm(alm, ALM, out_dtype=np.float64)
     columns = [fits.Column(name=name, format="D", array=np.full(20, 0.5)) for name in ("theta", "phi", "psi")]
@@ -305,7 +305,7 @@ def test_a_frame_may_stand_in_the_primary_header(tmp_path):
 
 
 def test_antenna_temperature_in_temptype(tmp_path):
-    unit = healpix.read_map(write_map(tmp_path / "map.fits", TEMPTYPE="ANTENNA"))[2]
+    unit = map_files.read_map(write_map(tmp_path / "map.fits", TEMPTYPE="ANTENNA"))[2]
     assert header.to_uk(unit, PATH, 94.0) == pytest.approx(antenna(94.0), rel=1e-6)
 
 

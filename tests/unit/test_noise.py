@@ -15,7 +15,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.instrument.scan import Moments
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.survey import survey
-from mcsim.sphere import header, healpix
+from mcsim.sphere import header, map_files
 from mcsim.sphere.mask import read_mask
 from refusals import refused
 
@@ -66,7 +66,7 @@ def run_with(noise, seed=3, **changes):
 @pytest.mark.parametrize(("file", "unit", "to_uk"), [("wmap", "mK", 1e3), ("planck", "K_CMB", 1e6)])
 def test_the_temperature_of_published_maps_is_read_in_its_frame_and_unit(file, unit, to_uk, request):
     path = Path(request.getfixturevalue(file))
-    map_, frame, found = healpix.read_map(path)
+    map_, frame, found = map_files.read_map(path)
     assert np.array_equal(map_, np.sin(PIXEL))
     assert (frame, found) == ("galactic", unit)
     assert header.to_uk(found, path) == to_uk
@@ -74,7 +74,7 @@ def test_the_temperature_of_published_maps_is_read_in_its_frame_and_unit(file, u
 
 def test_the_temperature_need_not_be_the_first_column(tmp_path):
     path = table(tmp_path / "turned.fits", {"HITS": HITS, "I_STOKES": np.sin(PIXEL)}, {"I_STOKES": "uK", "HITS": "1"})
-    map_, _, unit = healpix.read_map(Path(path))
+    map_, _, unit = map_files.read_map(Path(path))
     assert np.array_equal(map_, np.sin(PIXEL))
     assert unit == "uK"
 
@@ -88,13 +88,13 @@ def test_pixels_of_the_value_that_a_header_calls_bad_are_not_observed(bad, tmp_p
     }
     path = Path(table(tmp_path / "some.fits", columns, {"TEMPERATURE": "mK"}, COORDSYS="G", BAD_DATA=bad))
     expected = np.where(seen, 1e3 * columns["TEMPERATURE"], healpy.UNSEEN)
-    assert healpix.read_uk(path, "galactic", None) == pytest.approx(expected)
+    assert map_files.read_uk(path, "galactic", None) == pytest.approx(expected)
     [m] = survey(run_with({"sigma0_uk": 300.0, "hits": str(path)})).maps
     assert np.array_equal(m.moments.hits > 0, seen)
     weights = table(tmp_path / "mask.fits", {"MASK": np.where(seen, 0.5, float(bad))}, COORDSYS="G", BAD_DATA=bad)
     assert np.array_equal(read_mask(Path(weights), NSIDE, "galactic"), 0.5 * seen)
     with refused("BAD_DATA", "'none'", "number"):
-        healpix.read_map(Path(table(tmp_path / "none.fits", columns, BAD_DATA="none")))
+        map_files.read_map(Path(table(tmp_path / "none.fits", columns, BAD_DATA="none")))
 
 
 def test_part_of_the_sky_is_read_by_its_pixels(tmp_path):
@@ -102,8 +102,8 @@ def test_part_of_the_sky_is_read_by_its_pixels(tmp_path):
     nested = np.arange(100)
     path = Path(table(tmp_path / "part.fits", columns, units, pixels=nested, ORDERING="NESTED", OBJECT="PARTIAL"))
     seen = healpy.nest2ring(NSIDE, nested)
-    for names, expected, expected_unit in (((), np.sin(PIXEL), "mK"), (healpix.HITS, HITS, "counts")):
-        map_, _, unit = healpix.read_map(path, names)
+    for names, expected, expected_unit in (((), np.sin(PIXEL), "mK"), (map_files.HITS, HITS, "counts")):
+        map_, _, unit = map_files.read_map(path, names)
         assert np.array_equal(np.flatnonzero(map_ != healpy.UNSEEN), np.sort(seen))
         assert np.array_equal(map_[seen], expected[seen])
         assert unit == expected_unit
@@ -332,7 +332,7 @@ def test_a_lone_column_that_is_called_something_else_is_refused(noise, columns, 
 def test_what_is_no_temperature_is_no_map(name, tmp_path):
     path = Path(table(tmp_path / "bad.fits", {name: HITS}))
     with refused(path, name, "TEMPERATURE"):
-        healpix.read_uk(path, "galactic", None)
+        map_files.read_uk(path, "galactic", None)
 
 
 def test_another_nside_is_refused():

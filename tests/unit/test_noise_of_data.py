@@ -18,7 +18,7 @@ from refusals import refused
 NSIDE = 32
 NPIX = 12 * NSIDE**2
 SIGMA = 300.0
-HITS = np.stack([50.0 + np.arange(NPIX) % 31, 20.0 + np.arange(NPIX) % 57, 90.0 - np.arange(NPIX) % 43])
+HITS = np.random.default_rng(1).integers([[50], [20], [48]], [[81], [77], [91]], (3, NPIX)).astype(np.float64)
 
 
 def run_with(noise, splits=(), realizations=2, **changes):
@@ -159,7 +159,7 @@ def files(tmp_path):
     """Four maps of noise in K, anisotropic and correlated."""
     rng = np.random.default_rng(2)
     for number in range(4):
-        noise = np.repeat(5.0 * rng.standard_normal(NPIX // 4), 4)
+        noise = healpy.ud_grade(5.0 * rng.standard_normal(NPIX // 4), NSIDE)
         healpy.write_map(
             tmp_path / f"n_{number:03d}.fits", noise * 1e-6, column_units="K_CMB", dtype=np.float64, coord="G"
         )

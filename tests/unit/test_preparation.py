@@ -19,7 +19,7 @@ from mcsim.simulation import power, sampled, simulate, windows
 from mcsim.simulation.preparation import preparation
 from mcsim.simulation.steps import Average, Filled, Regression, Rotated, Weighted
 from mcsim.simulation.survey import survey
-from mcsim.sphere import healpix, rotation
+from mcsim.sphere import healpix, map_files, rotation
 from mcsim.sphere.sky import gaussian_alm
 from refusals import refused, unnamed
 
@@ -447,7 +447,7 @@ def test_files_are_prepared(tmp_path, rng):
     map_uk = rng.standard_normal(NPIX)
     healpy.write_map(tmp_path / "raw.fits", 1e-3 * map_uk, column_units="mK", coord="E", dtype=np.float64)
     [path] = prepare_files(run, [f"V={tmp_path / 'raw.fits'}"], tmp_path / "run=3")
-    found, frame, unit = healpix.read_map(path)
+    found, frame, unit = map_files.read_map(path)
     assert found == pytest.approx(prepare(run, map_uk), rel=1e-9)
     assert (path.name, frame, unit) == ("V.fits", "ecliptic", "uK")
     with refused(tmp_path / "run=3"):

@@ -23,7 +23,7 @@ from mcsim.instrument import scan
 from mcsim.instrument.scan import ScanModel
 from mcsim.instrument.scan.geometry import MapGrid
 from mcsim.simulation import mapmaking
-from mcsim.sphere import healpix
+from mcsim.sphere import map_files
 
 FRAGMENT = "wmap_maps/wmap_band_iqumap_r9_7yr_W_v4_first26264pix.fits"
 COARSE = "wmap_maps/wmap_band_iqumap_r9_7yr_W_v4_udgraded32.fits"
@@ -71,7 +71,7 @@ def density(model: ScanModel, lines: tuple[str, ...], theta: np.ndarray) -> np.n
 
 def kept(pairs: mapmaking.DifferencingScan, share: float, nside: int, pixel: np.ndarray) -> np.ndarray:
     """Share of a pixel's samples whose other side is not in the brightest ``share`` of the sky."""
-    coarse, _, _ = healpix.read_map(data_file(COARSE))
+    coarse, _, _ = map_files.read_map(data_file(COARSE))
     latitude = 90.0 - np.degrees(healpy.pix2ang(32, np.arange(coarse.size))[0])
     coarse = np.where(np.abs(latitude) < PLANE_DEG, coarse, -np.inf)
     bright = healpy.ud_grade((coarse > np.quantile(coarse, 1.0 - share)).astype(float), pairs.grid.nside)

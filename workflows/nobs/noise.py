@@ -33,7 +33,7 @@ from mcsim import config
 from mcsim.instrument.beams import Beam
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
-from mcsim.sphere import healpix, spectra
+from mcsim.sphere import healpix, map_files, spectra
 from mcsim.sphere.mask import read_mask
 
 NSIDE, BLOCK = 512, 64
@@ -132,7 +132,7 @@ def main() -> None:
     arguments = parser.parse_args()
     path = data_file("wmap_maps/wmap_band_iqumap_r9_7yr_W_v4_first26264pix.fits")
     ring = healpy.nest2ring(NSIDE, np.arange(PIXELS))
-    t, n_obs = 1e3 * healpix.read_map(path)[0][ring], healpix.read_map(path, healpix.HITS)[0][ring]
+    t, n_obs = 1e3 * map_files.read_map(path)[0][ring], map_files.read_map(path, map_files.HITS)[0][ring]
     mask = read_mask(data_file("wmap_maps/wmap_temperature_analysis_mask_r9_7yr_v4_udgraded32.fits"), NSIDE, "galactic")
     clean = np.all(mask[ring].reshape(-1, BLOCK) == 1.0, axis=1)
     latitude = healpy.pix2ang(NSIDE, np.arange(PIXELS), nest=True, lonlat=True)[1].reshape(-1, BLOCK).mean(axis=1)

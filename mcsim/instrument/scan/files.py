@@ -16,7 +16,7 @@ from mcsim.instrument.scan.moments import Moments
 from mcsim.instrument.scan.offsets import HIGHEST, exponents
 from mcsim.sphere.checks import nside_of
 from mcsim.sphere.header import first_table, opened, radians, stated_frame
-from mcsim.sphere.healpix import PIXEL
+from mcsim.sphere.map_files import PIXEL
 from mcsim.sphere.rotation import FRAMES
 from mcsim.support.folders import unreadable
 from mcsim.support.npy import read_npz
