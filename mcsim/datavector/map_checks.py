@@ -15,6 +15,7 @@ from mcsim.datavector.summaries import Element
 from mcsim.ensemble.external_maps import in_uk, parts_of
 from mcsim.ensemble.maps import POINTING, file_names, first_realization
 from mcsim.errors import InputError
+from mcsim.simulation import simulate
 from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.sphere.header import first_table, opened
 from mcsim.sphere.map_files import read_uk
@@ -22,6 +23,9 @@ from mcsim.sphere.pixel_order import check_ring
 from mcsim.support.arrays import Map
 from mcsim.support.folders import user_path
 from mcsim.support.numbers import some
+
+QUIET = 1e-3  #: noise of a pixel, uK, below which two maps of a channel may be the same but for round-off
+ALIKE = 1e-7  #: rms of their difference, over that of one of them, up to which they are
 
 
 def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
@@ -160,6 +164,28 @@ def warn_of_no_noise(model: Model) -> None:
             "give the channel noise (noise.sigma0_uk or noise.depth_uk_arcmin above 0), unless the data have none.",
             stacklevel=3,
         )
+
+
+def check_splits_differ(model: Model) -> None:
+    """Raise InputError for a channel whose first two maps are simulated alike: nothing is measured by their difference.
+
+    Its numbers would be constant, or have the scatter of round-off alone.
+    """
+    several = [channel.maps for channel in model.survey.channels if len(channel.maps) > 1]
+    quiet = [maps for maps in several if all(m.noise_uk is None or np.max(m.noise_uk) < QUIET for m in maps[:2])]
+    if not quiet:
+        return
+    names = [part.name for part in model.parts]
+    drawn = dict(zip(names, simulate.maps(model.survey, 0), strict=True))
+    for one, other in (maps[:2] for maps in quiet):
+        a, b = (drawn[m.name] for m in (one, other))
+        seen = (a != healpy.UNSEEN) & (b != healpy.UNSEEN)
+        if np.std((a - b)[seen]) <= ALIKE * np.std(a[seen]):
+            raise InputError(
+                f"the model has no noise in {one.name} and {other.name}, or hardly any, and simulates the same map for "
+                f"both, so that their difference measures nothing; give their channel noise (noise.sigma0_uk or "
+                f"noise.depth_uk_arcmin), at least of {ALIKE:g} of the sky's rms, or leave out map.splits."
+            )
 
 
 def check_differ(model: Model, maps: Sequence[Map], names: Sequence[str]) -> None:

@@ -194,7 +194,7 @@ def _beam_block(model: Model, part: int) -> Block:
     top = settings.beam_orders if part == model.of(own.channel)[0] else settings.split_beam_orders
     kernels, elements = [], []
     shown = model.last_shown(own.channel)
-    for s in range(min(top, own.moments.smax) + 1):
+    for s in range(min(top, own.moments.smax, model.lmax) + 1):
         shape = beam.blm[0, : model.lmax + 1].real * (ell / model.lmax) ** max(s, 1)
         # Above these orders the channel's sum is measured, in the place of its first map.
         alike = whole if s <= settings.split_beam_orders else replace(whole, split=None, fold=None)

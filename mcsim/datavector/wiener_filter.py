@@ -170,7 +170,7 @@ def filtered_sky(model: Model, clean: Sequence[Map], careful: bool = False) -> A
 
 def _transforms(model: Model, members: tuple[int, ...]) -> Iterator[tuple[int, int, tuple[int, ...]]]:
     """Yield the map in whose place a transform is kept, its order, and the maps that it adds up."""
-    for s in range(1, model.settings.beam_orders + 1):
+    for s in range(1, min(model.settings.beam_orders, model.lmax) + 1):
         filtered = tuple(i for i in members if model.parts[i].moments.smax >= s)
         if s <= model.settings.split_beam_orders:
             yield from ((i, s, (i,)) for i in filtered)

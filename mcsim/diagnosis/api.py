@@ -18,7 +18,14 @@ from mcsim.datavector.analysis import Analysis, Job, analysis_of, check_asked, d
 from mcsim.datavector.campaign import asking, batch
 from mcsim.datavector.candidate import TemplateBank
 from mcsim.datavector.kept import Kept
-from mcsim.datavector.map_checks import check_pixels, checked_maps, given_maps, of_pixel_means, warn_of_no_noise
+from mcsim.datavector.map_checks import (
+    check_pixels,
+    check_splits_differ,
+    checked_maps,
+    given_maps,
+    of_pixel_means,
+    warn_of_no_noise,
+)
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.seeds import Checked
 from mcsim.datavector.settings import DiagnosisSettings
@@ -239,6 +246,7 @@ def _analysed(
         )
     if table is None:
         check_pixels(analysis.model, analysis.elements)
+        check_splits_differ(analysis.model)
     power.check(analysis.model.survey)
     if given and source is None:
         warn_of_no_noise(analysis.model)
