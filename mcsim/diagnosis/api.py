@@ -104,6 +104,8 @@ def diagnose(
     RunError
         If a simulator of another program fails; the same call goes on where it ended.
     """
+    if data is None:
+        raise InputError("the data are None; give a folder with the observed maps, the maps, or a table of spectra.")
     run, source = loaded(model)
     settings = settings_of(settings, DiagnosisSettings)
     wanted, (settings, library, asked) = settings.controls, _with_library(settings)

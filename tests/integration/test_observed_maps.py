@@ -52,6 +52,12 @@ def test_the_cost_of_a_diagnosis_is_said_of_data_that_can_be_used(small, folder)
         api.describe(small.run, settings, folder)
 
 
+def test_no_data_are_refused_before_the_model_is_read(tmp_path):
+    """They ended in a traceback once the model was simulated."""
+    with refused(None):
+        mcsim.diagnose(tmp_path / "nosuch.toml", None)
+
+
 def test_data_that_cannot_be_read_are_refused_before_the_survey_is_prepared(small, folder, monkeypatch):
     monkeypatch.setattr(api, "analysis_of", None)
     cut = folder / "cut"
