@@ -83,7 +83,7 @@ def share_left_out(part: Part, map_: Map) -> float:
 
 
 def exchanges(parts: Sequence[Part]) -> list[tuple[int, ...]]:
-    """Return the orders of the maps in which two channels, or two splits of all channels, are exchanged."""
+    """Return the orders of the maps in which two channels, or two splits of all channels or of one, are exchanged."""
     keys: list[tuple[int | str | None, ...]] = [(part.channel, part.split) for part in parts]
     found = []
     for axis in (0, 1):
@@ -91,6 +91,10 @@ def exchanges(parts: Sequence[Part]) -> list[tuple[int, ...]]:
             swap = {one: other, other: one}
             moved = [tuple(swap.get(k, k) if i == axis else k for i, k in enumerate(key)) for key in keys]
             found.append(tuple(keys.index(key) for key in moved))
+    channels = dict.fromkeys(part.channel for part in parts)
+    own = [[i for i, part in enumerate(parts) if part.channel == channel] for channel in channels]
+    for one, other in (pair for members in own for pair in combinations(members, 2) if len(own) > 1):
+        found.append(tuple({one: other, other: one}.get(i, i) for i in range(len(parts))))
     return found
 
 

@@ -414,6 +414,7 @@ def test_maps_of_another_order_are_noticed(small):
     assert found.verdict["notes"][0] == found.orders[0]
     assert found.orders[0] in words.sentence(found)
     assert "V1:half1 as V1:half2" in notes([maps[i] for i in (1, 0, 3, 2)])
+    assert notes([maps[i] for i in (1, 0, 2, 3)]).endswith("exchanged: V1:half2 as V1:half1, V1:half1 as V1:half2.")
     assert "NESTED" not in notes(maps)
     # Maps that are alike fit in any order, and where nothing departs none is said.
     for changed in ({"alpha": 1e-300}, {"odds_cut": 1e300}):
