@@ -84,3 +84,22 @@ def test_no_pattern_has_no_covariance_and_three_draws_are_refused():
     assert error == 0.0
     with refused(3):
         covariance_of_draws(np.ones((4, 3)))
+
+
+def test_scale_and_error_are_those_of_explicit_held_out_draws():
+    """The mean chi^2 of held-out draws is p, and its variance beyond that of noise is what is returned."""
+    rng, p, count = np.random.default_rng(3), 9, 6
+    draws = np.linspace(9.0, 0.5, p)[:, None] * rng.normal(size=(p, count))
+    deviations = (draws - draws.mean(axis=1, keepdims=True)) * np.sqrt((1.0 + 1.0 / count) / (count - 1.0))
+    weight, scale, error = _HeldOut.of(deviations).best()
+    mean, noise = np.empty((2, count))
+    for k in range(count):
+        others = without(deviations, k)
+        R = scale * ((1.0 - weight) * others @ others.T + weight * np.sum(others**2) / p * np.eye(p))
+        inverse, z = np.linalg.inv(np.eye(p) + R), deviations[:, k] * np.sqrt(count)
+        # (z + n)'A(z + n) with standard normal n.
+        mean[k] = z @ inverse @ z + np.trace(inverse)
+        noise[k] = 4.0 * z @ inverse @ inverse @ z + 2.0 * np.trace(inverse @ inverse)
+    assert np.mean(mean) == pytest.approx(p, rel=1e-4)
+    assert error == pytest.approx((np.mean(noise) + np.var(mean, ddof=1) - 2.0 * p) / (p * (p + 2.0)), rel=1e-6)
+    assert error > 0.0
