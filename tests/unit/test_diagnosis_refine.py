@@ -8,7 +8,7 @@ import pytest
 
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.diagnosis.partial import PartialSearch
+from mcsim.diagnosis.partial import PartialSearch, has_settled
 from mcsim.diagnosis.refine import Refiner, _nearly_best
 from mcsim.diagnosis.selection import Selection, attribute
 from mcsim.errors import InputError
@@ -282,6 +282,20 @@ def test_what_is_none_of_the_library_stays_unknown_beside_two_that_are():
     assert found.verdict == "unknown"
 
 
+def test_the_share_that_detected_effects_leave_is_that_of_unbiased_chi2():
+    """Of few simulations chi^2 is larger on average, the less so the more simulations there are."""
+    instrument, few, size = Instrument(bend=0.0, cross=0.0), 120, 16.0
+    instrument.null = SimulatedGaussian(np.zeros(P), np.eye(P), few)
+    groups = instrument.null.whiten_groups(instrument.t, [(0,), (1,), (2,)])
+    instrument.calibration = calibrate(instrument.null, groups, draws=2000)
+    x = instrument.response(1.5 * size, 2.0 * size) + size * instrument.sideways[1]
+    found = instrument.refined(x).partial
+    assert sorted(found.members) == [0, 1]
+    # An inverse Wishart matrix of n degrees of freedom is n/(n - p - 1) times too large.
+    scale = (few - 2.0 - P) / (few - 1.0) / (1.0 + 1.0 / few) * size**2
+    assert found.left == pytest.approx((scale - (P - 2)) / (7.25 * scale - P), rel=1e-9)
+
+
 def test_amplitudes_that_run_away_are_not_detected():
     """Of a response that turns back upon itself no amplitude is the one that the fit asks for."""
     instrument = Instrument(bend=0.0, cross=0.0)
@@ -419,3 +433,12 @@ def test_those_that_explain_nearly_as_much_as_the_best_are_tried_up_to_twice_as_
     assert list(_nearly_best(explained, [1, 5], 1)) == [1]
     assert list(_nearly_best(explained, [], 2)) == []
     assert list(_nearly_best(explained, [0, 1], 0)) == []
+
+
+@pytest.mark.parametrize(
+    ("moved", "share", "settled"), [(0.5, 0.01, True), (2.0, 0.01, False), (0.2, 0.0, True), (0.5, 0.0, False)]
+)
+def test_amplitudes_settle_within_a_share_of_their_size_or_of_their_errors(moved, share, settled):
+    """At 100 errors a share of 0.01 is one error."""
+    settings, now = DiagnosisSettings(settled_sigma=0.3), np.array([5.0])
+    assert has_settled(settings, now - 0.05 * moved, now, np.array([[0.05**2]]), share) == settled
