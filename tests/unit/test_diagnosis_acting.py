@@ -8,6 +8,7 @@ import pytest
 from benches import Bench, P, twelve_and_two
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.selection import Selection, attribute
+from mcsim.stats.detection import log_evidence
 from mcsim.stats.scattered import Acting
 
 
@@ -46,3 +47,16 @@ def test_what_an_effect_adds_to_the_scatter_counts_over_that_of_what_is_drawn(be
     assert beside.scattered == (1,)
     assert alone.candidates[0].acting.chi2 > 4.0
     assert beside.candidates[0].acting.chi2 < 0.3 * alone.candidates[0].acting.chi2
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_sets_of_any_size_share_the_prior_of_all_drawings_of_their_members(bench, size):
+    """Of C^k ordered drawings of k candidates k! give the same set."""
+    x, settings = 9.0 * bench.t[:, 0] + 7.0 * bench.t[:, 1], DiagnosisSettings()
+    (search, *_) = Selection(bench.null, x, bench.t, bench.candidates, bench.calibration, settings).searches
+    members = np.arange(size)[None]
+    solved, columns = search.solve(members), int(search.groups.sizes[members].sum())
+    fall = search.total - solved.chi2
+    evidence = log_evidence(bench.null, search.total, fall, columns, settings.prior_snr)
+    prior = float(np.exp(solved.evidence - evidence)[0])
+    assert prior == pytest.approx([1.0, 2.0, 6.0][size - 1] / len(bench.candidates) ** size)
