@@ -78,3 +78,20 @@ def test_a_pattern_without_scatter_leaves_the_variance_beside_it() -> None:
     noise = SimulatedGaussian(np.zeros(P), np.eye(P), 1000)
     found = variance_beside(noise, np.eye(P)[:, :3], [(0,), (1,), (2,)], [0], [np.zeros((P, DRAWS))])
     np.testing.assert_array_equal(found, 1.0)
+
+
+def test_what_two_drawn_patterns_add_to_the_variance_beside_them_adds_up() -> None:
+    """Each is held out beside the noise and the other one."""
+    rng, noise = np.random.default_rng(3), SimulatedGaussian(np.zeros(P), np.eye(P), 100_000)
+    spectrum = 1000.0 / (1.0 + np.arange(P)) ** 2
+    patterns = [np.sqrt(spectrum)[:, None] * rng.normal(size=(P, DRAWS)) for _ in range(2)]
+    first, second = ((one - one.mean(axis=1, keepdims=True)) / np.sqrt(DRAWS - 1.0) for one in patterns)
+    t, columns = np.eye(P)[:, 8:13], [(k,) for k in range(5)]
+    alone = [
+        variance_beside(noise.with_extra_covariance(other), t, columns, [0, 1], [own]) - 1.0
+        for own, other in ((first, second), (second, first))
+    ]
+    told = np.all(np.array(alone) > 0.0, axis=0)  # by both: none makes less of it
+    assert told.sum() >= 2
+    both = variance_beside(noise, t, columns, [0, 1], [first, second]) - 1.0
+    np.testing.assert_allclose(both[told], sum(alone)[told], rtol=1e-9)

@@ -12,7 +12,7 @@ NSIDE, LMAX, SIGMA = 16, 31, 40.0
 
 
 def a_pair(splits: int, sky_uk: float, even: bool = False) -> SimpleNamespace:
-    """Return maps of one sky with noise that is even, or white over the square root of uneven hits, which is left of them."""
+    """Return maps of one sky with noise that is even, or over the square root of uneven hits, and is left of them."""
     rng, npix = np.random.default_rng(8), 12 * NSIDE**2
     hits = np.tile(np.where(np.arange(npix) < npix // 2, 4.0, 36.0), (splits, 1))
     noise = SIGMA * rng.normal(size=hits.shape) / (1.0 if even else np.sqrt(hits))
