@@ -26,6 +26,7 @@ it makes of noise and of the part of the sky that is not known, and what is like
 the difference of the two then."""
 
 MOVED = 0.1  #: share of coordinates by which they move from which on what they scatter is drawn anew
+TOGETHER = 3  #: members of the largest sets that are simulated where nothing else explains the data
 NEARLY = 0.8  #: share of what the best single candidate explains, from which on others are tried that explain less
 
 
@@ -116,6 +117,8 @@ class Refiner:
                 break
             found = self._attribute(now)
         now, found = self._with_smaller(now, self._completed(now, found))
+        if found.verdict == "unknown" and not found.faint:
+            now, found = self._with_sets(now, found, _Responses(t, t.copy(), list(candidates)))
         for index in self._displaced(now, first, found):
             alone = self._alone(now, start, index)
             own = self._completed(alone, self._attribute(alone))
@@ -165,13 +168,28 @@ class Refiner:
         """
         size = _size(found)
         for members in self._nearly(now, size):
-            beside = now.copy()
-            for index in members:
-                self._simulate_in_place(beside, tuple(one for one in members if one != index), index)
-            together = self._completed(beside, self._attribute(beside))
+            beside, together = self._in_place(now, members)
             if 0 < _size(together) < size:
                 return beside, together
         return now, found
+
+    def _with_sets(self, now: _Responses, found: Attribution, first: _Responses) -> tuple[_Responses, Attribution]:
+        """Return responses and attribution with a set that suffices once it is simulated from the ``first`` responses.
+
+        Two effects that bend may each explain less alone than others, which are simulated in their place.
+        """
+        for members in self._nearly(first, TOGETHER + 1):
+            beside, together = self._in_place(first, members)
+            if together.explanations:
+                return beside, together
+        return now, found
+
+    def _in_place(self, now: _Responses, members: tuple[int, ...]) -> tuple[_Responses, Attribution]:
+        """Return responses with the members of a set simulated at their amplitudes, and the attribution by them."""
+        beside = now.copy()
+        for index in members:
+            self._simulate_in_place(beside, tuple(one for one in members if one != index), index)
+        return beside, self._completed(beside, self._attribute(beside))
 
     def _nearly(self, now: _Responses, size: int) -> Iterator[tuple[int, ...]]:
         """Yield sets of several members, fewer than a size, that explain nearly as much as the best of as many."""

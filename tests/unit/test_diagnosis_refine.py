@@ -125,23 +125,31 @@ def test_the_amplitude_of_a_steep_response_is_where_its_secant_says_the_same(amp
 
 
 def test_an_amplitude_at_its_bound_is_simulated_once():
-    """The fit asks for 40, again and again; the effect ends at 12."""
+    """The fit asks for 40, again and again; the effect ends at 12. Beside another it is found within, at 10."""
     instrument = Steep(bend=0.0, cross=0.0)
     instrument.candidates[0] = replace(instrument.candidates[0], effect=Bounded)
-    instrument.refined(40.0 * instrument.t[:, 0])
-    assert [tables for tables in instrument.analysis if tables.get("A") == pytest.approx(12.0)] == [{"A": 12.0}]
+    found = instrument.refined(40.0 * instrument.t[:, 0]).attribution
+    assert [list(tables) for tables in instrument.analysis[:3]] == [["A"], ["B"], ["C"]]
+    assert instrument.analysis[0] == {"A": 12.0}
+    assert [one.members for one in found.explanations] == [(0,)]
+    assert found.explanations[0].fit.amplitudes == pytest.approx([10.0], abs=0.1)
 
 
-@pytest.mark.parametrize(("along", "first"), [(15.9, [["C"], ["A"]]), (21.0, [["C"], ["C"]])])
-def test_what_explains_nearly_as_much_as_the_best_is_tried_too(along, first):
-    """A is bent: its line explains 225 of 549, and C, which leaves something else, 253 or 441."""
+@pytest.mark.parametrize(("along", "tried"), [(15.9, 15.5), (21.0, 3.9)])
+def test_what_explains_nearly_as_much_as_the_best_is_tried_too(along, tried):
+    """A is bent: its line explains 225 of 549, and C, which leaves something else, 253 or 441.
+
+    Beside that A is tried at what it adds to C, once C alone has failed.
+    """
     instrument = Instrument(bend=0.08, cross=0.0)
     instrument.settings = DiagnosisSettings(tried=1)
     x = instrument.response(15.0, 0.0)
     size = float(np.linalg.norm(x))
     instrument.t[:, 2] = along * x / size**2 + np.sqrt(1.0 - (along / size) ** 2) * instrument.sideways[1]
-    instrument.refined(x)
-    assert [list(tables) for tables in instrument.analysis[:2]] == first
+    found = instrument.refined(x).attribution
+    assert [list(tables) for tables in instrument.analysis[:2]] == [["C"], ["A"]]
+    assert instrument.analysis[1]["A"] == pytest.approx(tried, abs=0.1)
+    assert [one.members for one in found.explanations] == [(0,)]
 
 
 def test_a_rival_is_simulated_at_its_amplitude_though_another_is_named():
