@@ -27,7 +27,13 @@ from mcsim.systematics.added import DipoleResidual
 
 SMALL = 2e-3  #: gain of a channel that observed skies may have in them: responses are wrong by less than this share
 
-BENT = 0.1  #: change of a beam at some degree, beside a gain, that observed skies may have in them
+BENT = 0.02
+"""Change of a beam at some degree, beside a gain, that observed skies may have in them: up to that share of a response
+that is simulated there is missing, with the weight that the channel has in the sky, and a fit is as much too large."""
+
+ASKEW = 0.1  #: what orders m > 0 add to a beam that observed skies may have in them: it is no sky, but for its square
+
+FAR = 0.1  #: gain up to which maps are divided by it
 
 NOISY = 0.2  #: change of the variance of noise that the filter of observed skies need not know
 
@@ -83,13 +89,13 @@ class SameSkies:
         -----
         A gain 1 + g of one channel, or of one map, is in the filtered sky with a weight w: its response there is 1 + w
         g times the true one, and a fit gives g/(1 + w g). So it is with each degree that a beam loses. Gains up to
-        SMALL and beams up to BENT, the steps of linear responses among them, stay. What orders m > 0 of a beam add to a
-        map is another map of the sky, which is in the filtered one with a weight, too: it is computed from the sky that
-        is found, and taken from the maps, until that sky changes no more. Other noise changes the weights. What effects
-        show without a sky, a foreground or a residual dipole behind a mask, is simulated and taken from the maps first.
-        Where a sky has a part of it already, the effect adds more than it did to the data, and the fit too little. A
-        modulation of the sky itself is undone in what was filtered: a fit would be too small by the square of its
-        amplitude.
+        SMALL and beams up to BENT stay, most steps of linear responses among them. What orders m > 0 of a beam add to a
+        map, beyond ASKEW, is another map of the sky, which is in the filtered one with a weight, too: it is computed
+        from the sky that is found, and taken from the maps, until that sky changes no more. Other noise changes the
+        weights. What effects show without a sky, a foreground or a residual dipole behind a mask, is simulated and
+        taken from the maps first. Where a sky has a part of it already, the effect adds more than it did to the data,
+        and the fit too little. A modulation of the sky itself is undone in what was filtered: a fit would be too small
+        by the square of its amplitude.
         """
         return self._skies(self.seen(found))
 
@@ -154,10 +160,10 @@ class SameSkies:
     def _split(self, factors: Factors) -> tuple[Vector, Matrix]:
         """Return gains by which maps are divided, (channel,), and what else changes each degree, (channel, lmax + 1).
 
-        A gain beyond BENT makes noise far from what the filter takes it to be, if maps are divided by it.
+        A gain beyond FAR makes noise far from what the filter takes it to be, if maps are divided by it.
         """
         rows = np.array(factors) if factors else np.ones_like(self.analysis.model.response)
-        gains = np.where((np.ptp(rows, axis=1) == 0.0) & (np.abs(rows[:, 0] - 1.0) <= BENT), rows[:, 0], 1.0)
+        gains = np.where((np.ptp(rows, axis=1) == 0.0) & (np.abs(rows[:, 0] - 1.0) <= FAR), rows[:, 0], 1.0)
         return gains, rows / gains[:, None]
 
     def spread(self, factors: Factors, noise: Noise = ()) -> Cl | None:
@@ -222,7 +228,7 @@ class SameSkies:
             change[: len(before)] -= before
             change[0] = 0.0
             little = np.abs(change).max() == 0.0 or made.side_b is not None
-            little = little or divided(np.abs(change).max(axis=0), np.abs(before[0])).max() <= BENT
+            little = little or divided(np.abs(change).max(axis=0), np.abs(before[0])).max() <= ASKEW
             rows.append(b"" if little else change.tobytes())
         return tuple(rows) if any(rows) else ()
 
