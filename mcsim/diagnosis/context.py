@@ -208,6 +208,16 @@ class DataSet(ABC, Generic[Data]):
         """Return sentences on orders of the maps in which the model fits, if it does not in that of the data."""
         return []
 
+    @property
+    def noise_in_common(self) -> list[str]:
+        """Return a sentence on noise that maps have in common, if the model fits with it."""
+        return []
+
+    @property
+    def instead(self) -> list[str]:
+        """Return sentences on what describes the data and is no effect: noise in common, or another order of maps."""
+        return (self.noise_in_common if self.gap.pvalue <= self.context.settings.alpha else []) or self.exchanged
+
     def stands_out_beside(self, found: Sequence[config.Effect]) -> bool:
         """Return True if places of maps stand out that are not what effects add to them."""
         return False

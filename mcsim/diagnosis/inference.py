@@ -36,25 +36,25 @@ EXPLAINED = 0.5  #: share of the excess chi^2 that a single effect explains whic
 def diagnose_data(data: DataSet, case: str) -> DiagnosisResult:
     """Diagnose observed maps or measured spectra; raise InputError if they cannot be what they claim to be."""
     context = data.context
-    if _is_out_of_order(data, first := Refiner(data).unrefined()):
+    if _is_no_effect(data, first := Refiner(data).unrefined()):
         first = replace(first, attribution=first.attribution.unexplained())
-        return replace(result_of(data, case, first, None, data.notes()), orders=tuple(data.exchanged))
+        return replace(result_of(data, case, first, None, data.notes()), orders=tuple(data.instead))
     t = data.templates()
     start = bent_templates(context.null, data.x, t, context.bank.curvature, context.candidates)
     refined = Refiner(data).run(t, context.candidates, start=start)
     plain = data, refined
     data, refined = with_found_noise(data, refined)
     found, reduction = refined.attribution.if_named(data.context.settings), None
-    # An order of the maps in which the model fits says more than any effects, but for a single one.
-    exchanged = [] if found.explanations and len(found.explanations[0].members) == 1 else data.exchanged
+    # What describes the data and is no effect says more than any effects, but for a single one.
+    instead = [] if found.explanations and len(found.explanations[0].members) == 1 else data.instead
     refusals = list[str]()
-    if not exchanged:
+    if not instead:
         data, refined, found, refusals = _compared(data, refined)
         if data.context.noise and found.explanations and not _has_noise(refined, found):
             data, refined, found, refusals = _compared(*plain)  # noise that is not there hides what is left
     notes = [*in_words(data.context), *data.notes()]
     context, detected = data.context, refined.partial
-    if exchanged:
+    if instead:
         found, detected = found.unexplained(), None
     elif found.explanations:
         found = _with_errors(data, refined, found)
@@ -65,14 +65,16 @@ def diagnose_data(data: DataSet, case: str) -> DiagnosisResult:
             refusals.append(why)
             found, reduction = found.unexplained(), None
     # What the rest of the data contradicts is not detected in it; after an unknown gap it was looked for already.
-    searched = exchanged or refusals or found.faint or refined.attribution.verdict == "unknown"
+    searched = instead or refusals or found.faint or refined.attribution.verdict == "unknown"
     if found.verdict == "unknown" and not searched:
         detected = PartialSearch(data).run(refined.templates, refined.candidates)
     notes += refusals
+    if found.verdict == "none":
+        notes += data.noise_in_common
     for own in found.explanations[:1] if detected is None else [detected]:
         notes += as_seen(context, own.members, own.fit)
     refined = replace(refined, attribution=found, partial=detected)
-    return replace(result_of(data, case, refined, reduction, notes), orders=tuple(exchanged))
+    return replace(result_of(data, case, refined, reduction, notes), orders=tuple(instead))
 
 
 def _compared(data: DataSet, refined: Refined) -> tuple[DataSet, Refined, Attribution, list[str]]:
@@ -93,11 +95,11 @@ def _has_noise(refined: Refined, found: Attribution) -> bool:
     return any(refined.candidates[member].parametrization.noise_alone for member in members)
 
 
-def _is_out_of_order(data: DataSet, first: Refined) -> bool:
-    """Return True if the model fits the maps in another order, and no effect alone explains much as they are."""
+def _is_no_effect(data: DataSet, first: Refined) -> bool:
+    """Return True if maps in another order, or with noise in common, fit the model, and no effect explains much."""
     gap = first.attribution.gap
     most = max((fit.delta_chi2 for fit in first.attribution.singles), default=0.0)
-    return most < EXPLAINED * (gap.chi2 - gap.dimension) and bool(data.exchanged)
+    return most < EXPLAINED * (gap.chi2 - gap.dimension) and bool(data.instead)
 
 
 def confirmed(

@@ -18,6 +18,7 @@ from mcsim.datavector.same_skies import SameSkies, Skies
 from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.output import DIGEST, digest
+from mcsim.diagnosis.shared_noise import shared_noise
 from mcsim.support.arrays import Map, Matrix, Vector
 from mcsim.systematics import if_possible
 
@@ -183,6 +184,12 @@ class ObservedMaps(DataSet[Sequence[Map]]):
                 pairs = ", ".join(words for k, words in enumerate(moved) if order[k] != k)
                 notes.append(f"The model fits (p = {p:.2g}) with maps exchanged: {pairs}.")
         return notes
+
+    @cached_property
+    def noise_in_common(self) -> list[str]:
+        """Return a sentence on noise that maps have in common, if the model fits with it."""
+        found = shared_noise(self.context.of_model, self.x, self._measured[1])
+        return [] if found is None else [found.sentence([part.name for part in self.context.analysis.model.parts])]
 
     @property
     def folds(self) -> tuple[str, str]:

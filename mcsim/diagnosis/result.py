@@ -102,7 +102,8 @@ class DiagnosisResult:
         After an unknown gap, what is missing, the most evident structure first; and the reduction of the excess on
         held-out data by all of it. None: not looked for, not measured.
     orders
-        Orders of maps or pixels in which the model fits, a sentence on each: all that is said of an unknown gap then.
+        Orders of maps or pixels in which the model fits, or noise in common with which it does, a sentence on each: all
+        that is said of an unknown gap then.
     untested
         Elements that are not tested, in words: they follow the square of a nuisance as wide as its prior.
     """
