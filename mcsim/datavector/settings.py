@@ -142,7 +142,7 @@ class DiagnosisSettings:
     noise_floor
         Least noise per pixel over the rms of the sky.
     hole_iterations
-        Iterations of filling unobserved pixels with the filtered sky.
+        Most iterations of filling unobserved pixels with the filtered sky; 0: they are zero.
     hidden_share
         Share of the sky that a map lacks, as behind a mask, from which on maps are filtered by their inverse
         covariance, and not isotropically. 0: always, which costs a quarter more for each simulation. Maps that show the
@@ -257,7 +257,7 @@ class DiagnosisSettings:
     beam_orders: int = 4
     split_beam_orders: int = 2
     noise_floor: float = 1e-3
-    hole_iterations: int = 12
+    hole_iterations: int = 30
     hidden_share: float = 0.01
     filter_tolerance: float = 1.0
     filter_iterations: int = 30

@@ -18,13 +18,14 @@ db_ls, acts as 2 Re[w_s db_ls ...] and its matched filter is sum_l Re[conj(db_ls
 each order gives that of every beam.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, reduce
 
 import healpy
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, gmres
 
 from mcsim.bipolar import by_degree
 from mcsim.datavector import pixel_noise
@@ -32,7 +33,9 @@ from mcsim.datavector.filter_model import Model
 from mcsim.simulation import convolve
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
-from mcsim.support.arrays import Alm, Map, divided
+from mcsim.support.arrays import Alm, Map, Vector, divided
+
+FILLED = 0.01  #: part of the sky in unobserved pixels up to which it is left to be found
 
 
 @dataclass(frozen=True)
@@ -126,20 +129,47 @@ def _summed(model: Model, maps: Sequence[Map]) -> tuple[Map, Map]:
 def cleaned(model: Model, maps: Sequence[Map]) -> tuple[list[Map], list[NDArray[np.bool_]]]:
     """Return maps with zeros in pixels that the fiducial scan does not hit, and where something was observed.
 
-    Pixels that the data lack and the simulations have are filled with the filtered sky: zeros would be a departure of
-    their own.
+    Pixels that the data lack and the simulations have are filled with the sky that is filtered from maps with them:
+    zeros would be a departure of their own.
     """
     hit = [part.precision > 0 for part in model.parts]
     seen = [h & (map_ != healpy.UNSEEN) & np.isfinite(map_) for h, map_ in zip(hit, maps, strict=True)]
     clean = [np.where(observed, map_, 0.0) for observed, map_ in zip(seen, maps, strict=True)]
     holes = {i: hit[i] & ~seen[i] for i in range(len(hit)) if np.any(hit[i] & ~seen[i])}
-    for _ in range(model.settings.hole_iterations if holes else 0):
-        sky = filtered_sky(model, clean)
+    if holes and model.settings.hole_iterations:
+        clean = _filled(model, clean, holes)
+    return [part.without_subtracted(map_) for part, map_ in zip(model.parts, clean, strict=True)], seen
+
+
+def _filled(model: Model, clean: Sequence[Map], holes: Mapping[int, NDArray[np.bool_]]) -> list[Map]:
+    """Return maps with what they show of their filtered sky in the holes of some, by number.
+
+    Notes
+    -----
+    Filled pixels h and that sky depend on each other, h = A h + b. Putting the sky of the last round in their place
+    comes near the solution in as many rounds as the sky in a hole that all maps have is above the noise, and with bare
+    quadrature diverges at the poles. So h is found by GMRES, with the more careful analysis.
+    """
+    ends = np.cumsum([0, *(int(hole.sum()) for hole in holes.values())])
+
+    def with_pixels(values: Vector) -> list[Map]:
+        maps = list(clean)
+        for (i, hole), start, end in zip(holes.items(), ends, ends[1:], strict=False):
+            maps[i] = maps[i].copy()
+            maps[i][hole] = values[start:end]
+        return maps
+
+    def shown(values: Vector) -> Vector:
+        sky, found = filtered_sky(model, with_pixels(values), careful=True), []
         for i, hole in holes.items():
             through = alm_.multiply(sky, model.response[model.parts[i].channel], model.lmax)
-            smooth = healpix.synthesis(through[None], model.nside, model.lmax)[0]
-            clean[i] = np.where(hole, smooth, clean[i])
-    return [part.without_subtracted(map_) for part, map_ in zip(model.parts, clean, strict=True)], seen
+            found.append(healpix.synthesis(through[None], model.nside, model.lmax)[0][hole])
+        return np.concatenate(found)
+
+    alone, size = shown(np.zeros(ends[-1])), (ends[-1], ends[-1])
+    operator = LinearOperator(size, matvec=lambda values: values - (shown(values) - alone))
+    most = model.settings.hole_iterations
+    return with_pixels(gmres(operator, alone, rtol=FILLED, restart=most, maxiter=1)[0])
 
 
 def over_masks(model: Model, clean: list[Map]) -> tuple[Model, list[Map]]:
