@@ -4,9 +4,11 @@ import healpy
 import numpy as np
 import pytest
 
+import mcsim
 from instruments import ask, data_of, learned_small
-from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.observed_maps import ObservedMaps, check_zeros
 from mcsim.simulation import simulate
+from refusals import refused
 
 
 @pytest.fixture(scope="module")
@@ -30,3 +32,20 @@ def test_a_hole_of_perfect_maps_is_no_gap(small, pixels, which):
         for number in which:
             maps[number][pixels] = healpy.UNSEEN
         assert ObservedMaps(small, maps, ask).gap.pvalue > 0.3 * whole
+
+
+def test_few_pixels_that_are_exactly_zero_are_refused_at_once(small):
+    """A modulation of the sky and a foreground were detected, without a word on the pixels."""
+    maps = dict(zip(small.analysis.model.survey.map_names, simulate.maps(data_of(small.run), 0), strict=True))
+    maps["W1:half1"][7:27] = 0.0
+    with refused("W1:half1", "20 pixels", "UNSEEN"):
+        mcsim.diagnose(small.run, maps)
+
+
+def test_rounded_maps_may_be_zero_and_so_may_what_is_not_observed(small):
+    names = small.analysis.model.survey.map_names
+    maps = [np.round(one) for one in simulate.maps(data_of(small.run), 0)]
+    assert np.sum(maps[0] == 0.0) > 3
+    check_zeros(small.analysis.model, dict(zip(names, maps, strict=True)))
+    hidden = [np.where(np.arange(one.size) < 20, healpy.UNSEEN, one) for one in maps]
+    check_zeros(small.analysis.model, dict(zip(names, hidden, strict=True)))
