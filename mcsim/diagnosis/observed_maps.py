@@ -22,7 +22,7 @@ from mcsim.diagnosis.output import DIGEST, digest
 from mcsim.diagnosis.shared_noise import shared_noise
 from mcsim.errors import InputError
 from mcsim.sphere.checks import UNSEEN_BELOW
-from mcsim.support.arrays import Map, Matrix, Vector
+from mcsim.support.arrays import Map, Matrix, Vector, divided
 from mcsim.systematics import if_possible
 
 ZEROS = 3  #: pixels with the value 0, over those of any other value, up to which they may be measured
@@ -242,21 +242,32 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         drawn = len(ensemble.bipolar_scan)
         return standardised(coarse, ensemble.residual_mean, ensemble.residual_scatter, drawn)
 
-    def _outstanding(self, maps: Matrix) -> dict[int, dict[int, float]]:
-        return outstanding(maps, len(self.context.ensemble.bipolar_scan), STANDS_OUT)
+    def _outstanding(self, coarse: Map) -> dict[int, dict[int, float]]:
+        """Return what stands out of residual maps, (map, npix).
+
+        What nuisances scatter is large in some places, beside which others would stand out that have it not: then
+        residuals count over the noise alone.
+        """
+        ensemble, npix = self.context.ensemble, coarse.shape[1]
+        maps = self._standardised(coarse)
+        if ensemble.nuisances is not None:
+            precision = np.stack([part.precision for part in self.context.analysis.model.parts])
+            variance = healpy.ud_grade(precision, healpy.npix2nside(npix)).reshape(coarse.shape)
+            maps = (coarse - ensemble.residual_mean) * divided(1.0, np.sqrt(variance), np.nan)
+        return outstanding(maps, len(ensemble.bipolar_scan), STANDS_OUT)
 
     def stands_out_beside(self, found: Sequence[config.Effect]) -> bool:
         """Return True if places of the residual maps stand out that are not what effects add to the maps."""
-        if not self._outstanding(self.residual_maps()):
+        if not self._outstanding(self._measured[2]):
             return False
         model = self.context.analysis.model
         filtered = wiener_filter(model, self.same_skies.less_added(found))
-        return bool(self._outstanding(self._standardised(coarse_residuals(model, filtered))))
+        return bool(self._outstanding(coarse_residuals(model, filtered)))
 
     def notes(self) -> list[str]:
         """Return a sentence on each map of whose residual places stand out as no effect lets them, and a remedy."""
         maps, model, said = self.residual_maps(), self.context.analysis.model, list[str]()
-        for number, sizes in self._outstanding(maps).items():
+        for number, sizes in self._outstanding(self._measured[2]).items():
             each = [healpy.pix2ang(healpy.npix2nside(maps.shape[1]), pixel, lonlat=True) for pixel in sizes]
             where = [f"longitude {round(lon) % 360}°, latitude {round(lat)}°".replace("-", "−") for lon, lat in each]
             where[PLACES:] = [f"{len(where) - PLACES} more"] * (len(where) > PLACES)

@@ -6,7 +6,7 @@ import healpy
 import numpy as np
 import pytest
 
-from instruments import ask, data_of, learned_small
+from instruments import ask, data_of, learned, learned_small, two_channels
 from mcsim import config, systematics
 from mcsim.datavector.campaign import with_effects
 from mcsim.diagnosis.inference import diagnose_data
@@ -76,3 +76,18 @@ def test_what_adds_a_place_may_be_named(small, shared):
     assert data.stands_out_beside([])
     assert data.stands_out_beside([config.Effect(name="dipole_residual", channel="W1", parameters={"amplitude": 3.0})])
     assert not data.stands_out_beside([spot])
+
+
+def test_what_a_nuisance_leaves_alone_does_not_stand_out():
+    """Residuals were compared with a scatter that is small where the dipole is 0: 16 times that of their map."""
+    table = two_channels("uncertain")
+    table["nuisance"] = [{"effect": "calibration", "channel": "W1", "width": 0.01}]
+    known = learned(table)
+    run = known.run
+    plain = replace(run, nuisances=())
+    for seed in range(900, 906):
+        maps = list(simulate.maps(data_of(plain, seed=seed), 0))
+        assert ObservedMaps(known, maps, ask).notes() == []
+    maps[2][SPOT] += 20.0 * data_of(plain).maps[2].noise_uk[SPOT]
+    (place, _) = ObservedMaps(known, maps, ask).notes()
+    assert place.startswith("One place of the residual of W1:half1 stands out")
