@@ -35,7 +35,7 @@ from mcsim.diagnosis.agreement import agreement
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
 from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.measured_spectra import MeasuredSpectra
-from mcsim.diagnosis.observed_maps import ObservedMaps, check_zeros
+from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.output import check_outside, check_replaced, digest
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.ensemble.external import ExternalModel, loaded
@@ -252,7 +252,6 @@ def _analysed(
     power.check(analysis.model.survey)
     if given and source is None:
         warn_of_no_noise(analysis.model)
-        check_zeros(analysis.model, given)
     return run, analysis, table, given
 
 

@@ -1,6 +1,6 @@
 """Observed maps: read them, refuse what the model cannot describe, and prepare them for a diagnosis."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -11,7 +11,6 @@ import numpy as np
 from mcsim import config
 from mcsim.datavector.bipolar_scan import coarse_residuals
 from mcsim.datavector.candidate import Candidate
-from mcsim.datavector.filter_model import Model
 from mcsim.datavector.localisation import Place, outstanding, places, standardised
 from mcsim.datavector.map_checks import exchanges, share_left_out
 from mcsim.datavector.nuisances import half_given_other
@@ -20,32 +19,15 @@ from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.output import DIGEST, digest
 from mcsim.diagnosis.shared_noise import shared_noise
-from mcsim.errors import InputError
-from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.support.arrays import Map, Matrix, Vector, divided
 from mcsim.systematics import if_possible
 
-ZEROS = 3  #: pixels with the value 0, over those of any other value, up to which they may be measured
 STANDS_OUT = 1e-6  #: probability up to which what stands out of a residual map is no chance
 PLACES = 5  #: of a map that a sentence has room for
 MASK_THEM = (
     "Glitches, sources and the Galaxy look so, and no effect on beam, gain or noise does: "
     "leave these pixels out and diagnose the maps again."
 )
-
-
-def check_zeros(model: Model, maps: Mapping[str, Map]) -> None:
-    """Raise InputError for maps, by the names of messages, with pixels that are exactly 0 as no measured value is.
-
-    Of maps with few digits many values are as frequent; a preparation may multiply with zeros.
-    """
-    for part, (name, map_) in zip(model.parts, maps.items(), strict=True):
-        values, counts = np.unique(map_[(part.precision > 0.0) & (map_ > UNSEEN_BELOW)], return_counts=True)
-        zeros, others = int(counts[values == 0.0].sum()), int(counts[values != 0.0].max(initial=0))
-        if not model.survey.config.preparation and zeros > ZEROS * others:
-            raise InputError(
-                f"{name} is exactly 0 in {zeros} pixels that the model observes; mark what was not observed as UNSEEN."
-            )
 
 
 @dataclass(frozen=True, eq=False)

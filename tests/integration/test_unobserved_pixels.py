@@ -6,7 +6,8 @@ import pytest
 
 import mcsim
 from instruments import ask, data_of, learned_small
-from mcsim.diagnosis.observed_maps import ObservedMaps, check_zeros
+from mcsim.datavector.map_checks import checked_maps
+from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.simulation import simulate
 from refusals import refused
 
@@ -46,6 +47,6 @@ def test_rounded_maps_may_be_zero_and_so_may_what_is_not_observed(small):
     names = small.analysis.model.survey.map_names
     maps = [np.round(one) for one in simulate.maps(data_of(small.run), 0)]
     assert np.sum(maps[0] == 0.0) > 3
-    check_zeros(small.analysis.model, dict(zip(names, maps, strict=True)))
+    checked_maps(small.analysis.model, dict(zip(names, maps, strict=True)))
     hidden = [np.where(np.arange(one.size) < 20, healpy.UNSEEN, one) for one in maps]
-    check_zeros(small.analysis.model, dict(zip(names, hidden, strict=True)))
+    checked_maps(small.analysis.model, dict(zip(names, hidden, strict=True)))
