@@ -64,6 +64,30 @@ def test_what_tells_nothing_is_taken(nside):
         check_ring(map_, "map")
 
 
+@pytest.mark.parametrize("nside", [16, 64])
+def test_stripes_along_rings_are_taken(nside):
+    """A NESTED reading puts pixels of one ring together: of scans at one declination, whole, in part and with noise."""
+    rng, npix = np.random.default_rng(6), 12 * nside**2
+    stripes, noise = rng.standard_normal(4 * nside)[healpy.pix2ring(nside, np.arange(npix))], rng.standard_normal(npix)
+    south = healpy.pix2vec(nside, np.arange(npix))[2] < -0.6
+    for map_ in (stripes, stripes + 0.5 * noise, (stripes > 0.0).astype(float), np.where(south, stripes, np.nan)):
+        check_ring(map_, "map")
+
+
+def test_noise_whose_neighbours_have_opposite_signs_is_taken():
+    """Neighbours of noise without its beam correlate by -0.3, which is less than 0 of any other order."""
+    np.random.seed(7)  # healpy's own
+    ell = np.arange(3.0 * NSIDE)
+    check_ring(healpy.synfast(np.exp(ell * (ell + 1.0) * (1.5 / NSIDE) ** 2), NSIDE, new=True), "map")
+
+
+def test_what_was_not_observed_is_no_neighbour_in_single_precision(maps):
+    """In the pixels that are seen there is white noise alone, in either order."""
+    noise = np.random.default_rng(8).standard_normal(NPIX)
+    part = np.where(maps[3] == healpy.UNSEEN, healpy.UNSEEN, noise)
+    check_ring(healpy.reorder(part, r2n=True).astype(np.float32).astype(float), "map")
+
+
 def test_files_of_maps_and_masks_are_refused(maps, tmp_path):
     nested = healpy.reorder(maps[4], r2n=True)
     path = Path(table(tmp_path / "mask.fits", {"TEMPERATURE": nested}))
