@@ -248,6 +248,7 @@ def _analysed(
         )
     if table is None:
         check_pixels(analysis.model, analysis.elements)
+    if table is None and source is None:
         check_splits_differ(analysis.model)
     power.check(analysis.model.survey)
     if given and source is None:

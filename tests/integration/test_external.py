@@ -398,6 +398,14 @@ def test_small_ensembles_are_refused_with_the_number_that_is_needed(tmp_path):
         mcsim.diagnose(mcsim.ExternalModel(MODEL, stack), list(stack[0]), settings=few)
 
 
+def test_noise_of_a_simulator_need_not_be_described():
+    """Splits of the description are the same map then, and those of the simulator are not."""
+    quiet = MODEL | {"channel": [{key: own for key, own in MODEL["channel"][0].items() if key != "noise"}]}
+    with refused("V:a", "V:b", "noise"):
+        api.describe(config.load(quiet), SETTINGS)
+    assert "simulations" in api.describe(mcsim.ExternalModel(quiet, Plain()), SETTINGS)
+
+
 def test_a_configuration_with_a_simulator_is_printed(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["mcsim", "config", str(EXAMPLE)])
     with pytest.raises(SystemExit) as stop:
