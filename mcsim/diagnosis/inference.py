@@ -15,7 +15,7 @@ from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import as_seen
 from mcsim.diagnosis.found_noise import in_words, with_found_noise
-from mcsim.diagnosis.naming import agreeing, unconfirmed
+from mcsim.diagnosis.naming import agreeing, leaves_places, unconfirmed
 from mcsim.diagnosis.partial import PartialSearch
 from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.result import DiagnosisResult
@@ -68,6 +68,7 @@ def diagnose_data(data: DataSet, case: str) -> DiagnosisResult:
     searched = instead or refusals or found.faint or refined.attribution.verdict == "unknown"
     if found.verdict == "unknown" and not searched:
         detected = PartialSearch(data).run(refined.templates, refined.candidates)
+    detected = None if detected is not None and leaves_places(data, detected) else detected
     notes += refusals
     if found.verdict == "none":
         notes += data.noise_in_common

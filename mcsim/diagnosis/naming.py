@@ -10,6 +10,7 @@ from mcsim.datavector.candidate import Candidate, parts_of, tables_at
 from mcsim.diagnosis.consistency import Action, Slices, contradiction
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import is_drawn
+from mcsim.diagnosis.partial import PartialExplanation
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.support.arrays import Matrix
@@ -36,7 +37,7 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
     sentences: list[str] = []
     for one in found.explanations:
         members = [candidates[member] for member in one.members]
-        if _leaves_places(data, one):
+        if leaves_places(data, one):
             refused.append(one)
             why = "places of the residual maps stand out, and are not what it adds to them"
             sentences.append(f"The data vector fits {_title(candidates, one)}, which is not named: {why}.")
@@ -73,7 +74,7 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
     return left, sentences
 
 
-def _leaves_places(data: DataSet, one: Explanation) -> bool:
+def leaves_places(data: DataSet, one: Explanation | PartialExplanation) -> bool:
     """Return True if places of the residual maps stand out that are not what a set adds to the maps."""
     acting: list[config.Effect] = []
     with if_possible():

@@ -66,6 +66,14 @@ def test_bad_pixels_of_one_map_are_named_nothing(small, shared):
     assert "noise level of W1" in refusal
 
 
+def test_what_explains_a_part_of_bad_pixels_is_not_detected(small, shared):
+    """Two of 60 and 50 errors were half explained by more noise."""
+    changed = [map_uk.copy() for map_uk in simulate.maps(shared, 2)]
+    changed[2][[2574, 803]] += np.array([60.0, -50.0]) * shared.maps[2].noise_uk[[2574, 803]]
+    found = diagnose_data(ObservedMaps(small, changed, ask), "glitches")
+    assert (found.kind, found.partial, found.contradicted) == ("unknown", (), ())
+
+
 def test_what_adds_a_place_may_be_named(small, shared):
     library = dict(small.analysis.library) | {"hot_spot": HotSpot}
     known = replace(small, analysis=replace(small.analysis, library=tuple(library.items())))
