@@ -12,6 +12,7 @@ from mcsim.stats.look_elsewhere import deviations, scan_pvalues
 from mcsim.support.arrays import Map, Matrix, Vector
 
 NEAR, NEAR_DEG = 0.8, 20.0  #: share that a place which stands out must reach over the pixels up to that distance
+FEWEST = 40  #: pixels of a map of which a place can stand out: the median of fewer tells no scatter
 FOLDS = 20  #: parts of the simulations, at most, each of which is compared with all others
 
 
@@ -91,16 +92,17 @@ def standardised(x: Map, mean: Map, scatter: Map, count: int) -> Map:
 def outstanding(maps: Matrix, count: int, level: float) -> dict[int, dict[int, float]]:
     """Return pixels and sizes, the largest first, of what stands out of each standardised residual map, (map, npix).
 
-    A residual counts over the scatter of its map, which what acts everywhere widens, if pixels that are independent
-    have one as large with a probability of at most ``level`` by chance; a share ``NEAR`` of that is asked for over the
-    scatter of the pixels near it, which uneven noise widens. ``count`` > 3 simulations told the scatter of pixels: the
-    deviates are those of Student's t. Maps of which nothing stands out are left out.
+    A residual counts over the scatter of its map, one or more, which what acts everywhere widens, if pixels that are
+    independent have one as large with a probability of at most ``level`` by chance; a share ``NEAR`` of that is asked
+    for over the scatter of the pixels near it, which uneven noise widens. ``count`` > 3 simulations told the scatter of
+    pixels: the deviates are those of Student's t. Maps of which nothing stands out, or with fewer than ``FEWEST``
+    pixels, are left out.
     """
     chance = level / max(int(np.isfinite(maps).sum()), 1)
     least = float(stats.t.isf(chance / 2.0, count - 1)) / np.sqrt((count - 1.0) / (count - 3.0))
     found = {}
     for number, one in enumerate(maps):
-        if not np.isfinite(one).any():
+        if np.isfinite(one).sum() < FEWEST:
             continue
         distance = np.abs(one - np.nanmedian(one))
         size = distance / _scatter(distance)
@@ -111,9 +113,11 @@ def outstanding(maps: Matrix, count: int, level: float) -> dict[int, dict[int, f
 
 
 def _scatter(distance: Vector) -> float:
-    """Return the scatter of which the median distance from the median is that of a Gaussian; infinite for 0."""
-    median = float(np.nanmedian(distance))
-    return median / float(stats.norm.ppf(0.75)) if median > 0.0 else np.inf
+    """Return the scatter of which the median distance from the median is that of a Gaussian, or the model's if less.
+
+    The median of few pixels can be small by chance.
+    """
+    return max(float(np.nanmedian(distance) / stats.norm.ppf(0.75)), 1.0)
 
 
 def _over_near(distance: Vector, pixel: int) -> float:

@@ -75,3 +75,13 @@ def test_a_glitch_stands_out_of_its_map_and_what_acts_everywhere_does_not():
     assert {number: list(sizes) for number, sizes in found.items()} == {1: [1234], 3: [1234], 6: [1000, 1234]}
     assert found[1][1234] == pytest.approx(12.0, abs=4.0)
     assert found[6][1000] == pytest.approx(30.0, abs=4.0)
+
+
+@pytest.mark.parametrize("seen", [0, 1, 3, 10, 40])
+def test_of_a_few_pixels_none_stands_out_by_chance(seen):
+    """The median distance of three from their median is that of the middle one: one of two such maps had a place."""
+    drawn = np.random.default_rng(4).standard_normal((1000, 1, 3072))
+    drawn[:, :, seen:] = np.nan
+    assert not any(outstanding(one, 10_000, 1e-6) for one in drawn)
+    drawn[0, 0, 0] = 100.0
+    assert list(outstanding(drawn[0], 10_000, 1e-6)) == [0] * (seen >= 40)
