@@ -33,7 +33,7 @@ class AddedMaps:
         return run if run and self._share(run) > TAKEN else ""
 
     def whole_run(self, found: Sequence[config.Effect]) -> Added:
-        """Return the run with those effects that can add to maps, however little; "" if none can."""
+        """Return the run with those effects that add to maps, if more than in a linear response; "" if none does."""
         own = [one for one in found if self._adds(one)]
         return config.to_json(with_effects(self.analysis.run, own)) if own else ""
 

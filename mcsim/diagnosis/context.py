@@ -218,6 +218,11 @@ class DataSet(ABC, Generic[Data]):
         """Return sentences on what describes the data and is no effect: noise in common, or another order of maps."""
         return (self.noise_in_common if self.gap.pvalue <= self.context.settings.alpha else []) or self.exchanged
 
+    @property
+    def x_without_places(self) -> Vector | None:
+        """Return the data vector of maps without the pixels of places that stand out; None if it cannot be had."""
+        return None
+
     def stands_out_beside(self, found: Sequence[config.Effect]) -> bool:
         """Return True if places of maps stand out that are not what effects add to them."""
         return False

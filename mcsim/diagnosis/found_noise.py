@@ -24,7 +24,8 @@ ROUNDS = 3  #: of finding noise with the scatter of what was found before
 def with_found_noise(data: DataSet, refined: Refined) -> tuple[DataSet, Refined]:
     """Return data and attribution with the scatter that data have with the noise that was found.
 
-    They are those that are given if none was found that moves chi^2 by STRONG, or mcsim does not simulate the model.
+    They are those that are given if none was found that moves chi^2 by STRONG, if mcsim does not simulate the model,
+    and beside places that stand out, which look like noise.
 
     Notes
     -----
@@ -33,7 +34,7 @@ def with_found_noise(data: DataSet, refined: Refined) -> tuple[DataSet, Refined]
     stay those from the model. The gap is tested as before.
     """
     model = data.context
-    if refined.attribution.verdict == "none" or model.analysis.source is not None:
+    if refined.attribution.verdict == "none" or model.analysis.source is not None or data.stands_out_beside([]):
         return data, refined
     for _ in range(ROUNDS):
         pair = None

@@ -68,7 +68,8 @@ def diagnose_data(data: DataSet, case: str) -> DiagnosisResult:
     searched = instead or refusals or found.faint or refined.attribution.verdict == "unknown"
     if found.verdict == "unknown" and not searched:
         detected = PartialSearch(data).run(refined.templates, refined.candidates)
-    detected = None if detected is not None and leaves_places(data, detected) else detected
+    if detected is not None and leaves_places(data, detected.templates, detected):
+        detected = None
     notes += refusals
     if found.verdict == "none":
         notes += data.noise_in_common

@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from mcsim import config
-from mcsim.datavector.candidate import Candidate, parts_of, tables_at
+from mcsim.datavector.candidate import Candidate, columns_of, parts_of, tables_at
 from mcsim.diagnosis.consistency import Action, Slices, contradiction
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import is_drawn
 from mcsim.diagnosis.partial import PartialExplanation
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import Attribution, Explanation
-from mcsim.support.arrays import Matrix
+from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import if_possible
 
 
@@ -22,7 +22,7 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
 
     The effects of a set are simulated at their amplitudes, and these are compared in parts of the data. An effect whose
     pattern on the sky is drawn has no such response: it is told from other signals on the sky by its frequencies alone.
-    No set is named beside places of the residual maps that stand out and are not what it adds to the maps.
+    Nor is a set named that places which stand out of the residual maps may have made (:func:`leaves_places`).
     Where another set agrees, one that parts contradict is not left out before it is ``odds_cut`` times less probable.
     What is left has to be as probable as ``named_probability`` asks for without what was left out.
     """
@@ -37,9 +37,9 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
     sentences: list[str] = []
     for one in found.explanations:
         members = [candidates[member] for member in one.members]
-        if leaves_places(data, one):
+        if leaves_places(data, refined.templates, one):
             refused.append(one)
-            why = "places of the residual maps stand out, and are not what it adds to them"
+            why = "places of the residual maps stand out, without which it has less than half of its S/N"
             sentences.append(f"The data vector fits {_title(candidates, one)}, which is not named: {why}.")
             continue
         if any(map(is_drawn, members)):
@@ -74,12 +74,25 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
     return left, sentences
 
 
-def leaves_places(data: DataSet, one: Explanation | PartialExplanation) -> bool:
-    """Return True if places of the residual maps stand out that are not what a set adds to the maps."""
-    acting: list[config.Effect] = []
+def leaves_places(data: DataSet, t: Matrix, one: Explanation | PartialExplanation) -> bool:
+    """Return True if places of the residual maps stand out that may be why a set fits: by its templates ``t``, (p, K).
+
+    They are not what it adds to the maps, and without their pixels some member has less than half of its S/N.
+    """
+    candidates, acting = data.context.candidates, list[config.Effect]()
     with if_possible():
-        acting = tables_at(data.context.candidates, one.members, one.fit)
-    return data.stands_out_beside(acting)
+        acting = tables_at(candidates, one.members, one.fit)
+    if not data.stands_out_beside(acting):
+        return False
+    if (x := data.x_without_places) is None:
+        return True
+
+    def snrs(x: Vector) -> list[float]:
+        found = data.context.null.fit(x, t[:, columns_of(candidates, one.members)])
+        parts = parts_of(candidates, one.members, found)
+        return [float(np.sqrt(theta @ np.linalg.pinv(covariance) @ theta)) for _, theta, covariance in parts]
+
+    return any(left < 0.5 * own for own, left in zip(snrs(data.x), snrs(x), strict=True))
 
 
 def _is_as_probable(one: Explanation, agreed: Sequence[Explanation], cut: float) -> bool:

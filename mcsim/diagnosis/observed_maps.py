@@ -238,6 +238,17 @@ class ObservedMaps(DataSet[Sequence[Map]]):
             maps = (coarse - ensemble.residual_mean) * divided(1.0, np.sqrt(variance), np.nan)
         return outstanding(maps, len(ensemble.bipolar_scan), STANDS_OUT)
 
+    @cached_property
+    def x_without_places(self) -> Vector | None:
+        """Return the data vector of the maps without the pixels of places that stand out; None if they are many."""
+        model, maps, coarse = self.context.analysis.model, list(self.data), self._measured[2]
+        for number, sizes in self._outstanding(coarse).items():
+            there = np.isin(np.arange(coarse.shape[1]), list(sizes))
+            hidden = healpy.ud_grade(there.astype(float), model.nside) > 0.0
+            maps[number] = np.where(hidden, healpy.UNSEEN, maps[number])
+        shares = map(share_left_out, model.parts, maps)
+        return None if max(shares) > self.context.settings.missing_share else self.context.analysis.data_vector(maps)
+
     def stands_out_beside(self, found: Sequence[config.Effect]) -> bool:
         """Return True if places of the residual maps stand out that are not what effects add to the maps."""
         if not self._outstanding(self._measured[2]):
@@ -249,8 +260,11 @@ class ObservedMaps(DataSet[Sequence[Map]]):
     def notes(self) -> list[str]:
         """Return a sentence on each map of whose residual places stand out as no effect lets them, and a remedy."""
         maps, model, said = self.residual_maps(), self.context.analysis.model, list[str]()
-        for number, sizes in self._outstanding(self._measured[2]).items():
-            each = [healpy.pix2ang(healpy.npix2nside(maps.shape[1]), pixel, lonlat=True) for pixel in sizes]
+        nside = healpy.npix2nside(maps.shape[1])
+        for number, pixels in self._outstanding(self._measured[2]).items():
+            beside = {one: pixels.keys() & set(healpy.get_all_neighbours(nside, one).tolist()) for one in pixels}
+            sizes = {one: size for one, size in pixels.items() if all(pixels[near] < size for near in beside[one])}
+            each = [healpy.pix2ang(nside, pixel, lonlat=True) for pixel in sizes]
             where = [f"longitude {round(lon) % 360}°, latitude {round(lat)}°".replace("-", "−") for lon, lat in each]
             where[PLACES:] = [f"{len(where) - PLACES} more"] * (len(where) > PLACES)
             name, size = model.parts[number].name, f"{max(sizes.values()):.0f} times its scatter"

@@ -48,9 +48,9 @@ def check_ring(map_: Map, name: str) -> None:
         nested = nested if nested - left > LOST * (nested - ring) else ring
     if (other := max(nested, called_nested)) > ring + MORE:
         raise InputError(
-            f"{name} is smoother with its pixels in another order (neighbours correlate by {other:.2f}, as they are by "
-            f"{ring:.2f}), as a map that is NESTED and called RING, or the other way round; correct ORDERING in its "
-            "header, or reorder them."
+            f"{name} is smoother with its pixels in another order (neighbours correlate by {other:.2f}, by "
+            f"{ring:.2f} as they are), as a map that is NESTED and called RING, or the other way round; correct "
+            "ORDERING in its header, or reorder them."
         )
 
 

@@ -99,3 +99,14 @@ def test_what_a_nuisance_leaves_alone_does_not_stand_out():
     maps[2][SPOT] += 20.0 * data_of(plain).maps[2].noise_uk[SPOT]
     (place, _) = ObservedMaps(known, maps, ask).notes()
     assert place.startswith("One place of the residual of W1:half1 stands out")
+
+
+def test_a_strong_effect_is_named_beside_a_bad_pixel_of_another_map(small):
+    """The pixel is not why it fits: without it the S/N is the same."""
+    found = data_of(small.run, "beam_ellipticity", "W1", amplitude=0.3, angle_deg=20.0)
+    maps = [map_uk.copy() for map_uk in simulate.maps(found, 4)]
+    maps[0][1000] += 12.0 * found.maps[0].noise_uk[1000]
+    told = diagnose_data(ObservedMaps(small, maps, ask), "both")
+    assert [(one.name, one.channel) for one in told.effects] == [("beam_ellipticity", "W1")]
+    assert abs(told.effects[0].amplitude - 0.3) < 4.0 * told.effects[0].sigma
+    assert f"One place of the residual of {found.map_names[0]}" in told.notes[0]

@@ -36,7 +36,7 @@ def test_a_set_behind_others_that_parts_contradict_is_compared_too(monkeypatch):
     monkeypatch.setattr(naming, "slices_of", lambda data: SimpleNamespace(findings=findings))
     monkeypatch.setattr(naming, "_actions", lambda *_: [])
     context = SimpleNamespace(settings=settings, candidates=candidates, run=SimpleNamespace(channels=[]))
-    agreed, sentences = naming.agreeing(data_of(context), None, found)
+    agreed, sentences = naming.agreeing(data_of(context), SimpleNamespace(templates=None), found)
     assert compared == list("ABCDEF")
     assert agreed.verdict == "unknown"
     assert len(sentences) == len(each)
@@ -53,7 +53,7 @@ def of_two(monkeypatch, odds, probability, pvalue):
     monkeypatch.setattr(naming, "slices_of", lambda data: SimpleNamespace(findings=lambda *_: next(results)))
     monkeypatch.setattr(naming, "_actions", lambda *_: [])
     context = SimpleNamespace(settings=DiagnosisSettings(), candidates=candidates, run=SimpleNamespace(channels=[]))
-    return *naming.agreeing(data_of(context), None, found), bad
+    return *naming.agreeing(data_of(context), SimpleNamespace(templates=None), found), bad
 
 
 @pytest.mark.parametrize(("odds", "verdict"), [(1e-3, "effect"), (1e-5, "unknown")])
