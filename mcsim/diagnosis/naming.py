@@ -14,7 +14,7 @@ from mcsim.diagnosis.partial import PartialExplanation
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.support.arrays import Matrix, Vector
-from mcsim.systematics import if_possible
+from mcsim.systematics import acts_through, if_possible
 
 
 def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attribution, list[str]]:
@@ -77,9 +77,12 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
 def leaves_places(data: DataSet, t: Matrix, one: Explanation | PartialExplanation) -> bool:
     """Return True if places of the residual maps stand out that may be why a set fits: by its templates ``t``, (p, K).
 
-    They are not what it adds to the maps, and without their pixels some member has less than half of its S/N.
+    They are not what it adds to the maps, and without their pixels some member has less than half of its S/N. Noise
+    in excess of the model's may be a few strong glitches.
     """
     candidates, acting = data.context.candidates, list[config.Effect]()
+    if any(acts_through(candidates[member].effect, "excess") for member in one.members):
+        return False
     with if_possible():
         acting = tables_at(candidates, one.members, one.fit)
     if not data.stands_out_beside(acting):
