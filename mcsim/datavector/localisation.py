@@ -121,7 +121,8 @@ def _scatter(distance: Vector) -> float:
 
 
 def _over_near(distance: Vector, pixel: int) -> float:
-    """Return a distance over the scatter of the pixels around it."""
+    """Return a distance over the scatter of the pixels around it, some at least."""
     nside = healpy.npix2nside(len(distance))
-    near = healpy.query_disc(nside, healpy.pix2vec(nside, pixel), np.deg2rad(NEAR_DEG))
+    radius = max(np.deg2rad(NEAR_DEG), 3.0 * healpy.nside2resol(nside))
+    near = healpy.query_disc(nside, healpy.pix2vec(nside, pixel), radius)
     return float(distance[pixel]) / _scatter(distance[near])

@@ -93,10 +93,10 @@ def exchanges(parts: Sequence[Part]) -> list[tuple[int, ...]]:
             swap = {one: other, other: one}
             moved = [tuple(swap.get(k, k) if i == axis else k for i, k in enumerate(key)) for key in keys]
             found.append(tuple(keys.index(key) for key in moved))
-    channels = dict.fromkeys(part.channel for part in parts)
-    own = [[i for i, part in enumerate(parts) if part.channel == channel] for channel in channels]
-    for one, other in (pair for members in own for pair in combinations(members, 2) if len(own) > 1):
-        found.append(tuple({one: other, other: one}.get(i, i) for i in range(len(parts))))
+    if len({part.channel for part in parts}) > 1:  # else the splits of all channels are those of one
+        for one, other in combinations(range(len(parts)), 2):
+            if parts[one].channel == parts[other].channel:
+                found.append(tuple({one: other, other: one}.get(i, i) for i in range(len(parts))))
     return found
 
 
@@ -173,17 +173,17 @@ def warn_of_no_noise(model: Model) -> None:
 
 
 def check_splits_differ(model: Model) -> None:
-    """Raise InputError for a channel whose first two maps are simulated alike: nothing is measured by their difference.
+    """Raise InputError for two maps of a channel that are simulated alike: nothing is measured by their difference.
 
     Its numbers would be constant, or have the scatter of round-off alone.
     """
-    several = [channel.maps for channel in model.survey.channels if len(channel.maps) > 1]
-    quiet = [maps for maps in several if all(m.noise_uk is None or np.max(m.noise_uk) < QUIET for m in maps[:2])]
+    each = [[m for m in c.maps if m.noise_uk is None or np.max(m.noise_uk) < QUIET] for c in model.survey.channels]
+    quiet = [pair for maps in each for pair in combinations(maps, 2)]
     if not quiet:
         return
     names = [part.name for part in model.parts]
     drawn = dict(zip(names, simulate.maps(model.survey, 0), strict=True))
-    for one, other in (maps[:2] for maps in quiet):
+    for one, other in quiet:
         a, b = (drawn[m.name] for m in (one, other))
         seen = (a != healpy.UNSEEN) & (b != healpy.UNSEEN)
         if seen.any() and np.std((a - b)[seen]) <= ALIKE * np.std(a[seen]):

@@ -117,7 +117,7 @@ class Refiner:
                 break
             found = self._attribute(now)
         now, found = self._with_smaller(now, self._completed(now, found))
-        if found.verdict == "unknown" and not found.faint:
+        if found.verdict == "unknown" and not (found.faint or sets):
             now, found = self._with_sets(now, found, _Responses(t, t.copy(), list(candidates)))
         for index in self._displaced(now, first, found):
             alone = self._alone(now, start, index)
