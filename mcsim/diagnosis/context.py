@@ -17,6 +17,7 @@ from mcsim.datavector.localisation import Place
 from mcsim.datavector.nuisances import with_nuisances
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.diagnosis.shared_noise import CrossPowers
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
 from mcsim.support.arrays import Matrix, Vector
@@ -55,6 +56,11 @@ class DiagnosisContext:
     def frame(self) -> str:
         """Return the frame of the maps."""
         return self.analysis.model.frame
+
+    @cached_property
+    def cross_powers(self) -> CrossPowers:
+        """Return what noise that maps have in common does to the cross powers of residuals."""
+        return CrossPowers(self.analysis, self.ensemble.bipolar_scan)
 
     @property
     def of_model(self) -> "DiagnosisContext":

@@ -188,7 +188,9 @@ class ObservedMaps(DataSet[Sequence[Map]]):
     @cached_property
     def noise_in_common(self) -> list[str]:
         """Return a sentence on noise that maps have in common, if the model fits with it."""
-        found = shared_noise(self.context.of_model, self.x, self._measured[1])
+        known = self.context.of_model
+        level = known.settings.residual_level
+        found = shared_noise(known.cross_powers, known.null, level, self.x, self._measured[1])
         return [] if found is None else [found.sentence([part.name for part in self.context.analysis.model.parts])]
 
     @property

@@ -7,6 +7,7 @@ make by their products. This response is simulated without a sky: the mean over 
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations, combinations_with_replacement, product
 
 import healpy
@@ -16,10 +17,9 @@ from scipy import stats
 from mcsim.bipolar import by_degree
 from mcsim.datavector.analysis import Analysis
 from mcsim.datavector.wiener_filter import wiener_filter
-from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.sphere import rng
 from mcsim.stats.gaussian import SimulatedGaussian
-from mcsim.support.arrays import Map, Matrix, Vector
+from mcsim.support.arrays import Map, Matrix, Rows, Vector
 from mcsim.support.numbers import measured, p_equals
 
 LEVEL = 1e-4  #: p-value up to which the noise of two maps, of all pairs, is correlated
@@ -47,40 +47,72 @@ class SharedNoise:
         )
 
 
-def shared_noise(context: DiagnosisContext, x: Vector, bipolar_scan: Vector) -> SharedNoise | None:
+@dataclass(frozen=True, eq=False)
+class CrossPowers:
+    """Hold what correlations of the noise of maps do to the cross powers of residuals, for all data of a model.
+
+    ``drawn``, shape (simulations, numbers), are its simulations of the bipolar scan.
+    """
+
+    analysis: Analysis
+    drawn: Matrix
+
+    @cached_property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Return the pairs of maps, by number, whose noise can be correlated."""
+        return [pair for pair in combinations(range(len(self.analysis.model.parts)), 2) if _white(self.analysis, pair)]
+
+    @cached_property
+    def rows(self) -> Rows:
+        """Return the numbers of the scan that are powers of residuals, shape (map by map, ranges of degrees).
+
+        They are the highest ranges, of so many as the simulations suffice for.
+        """
+        each = len(list(combinations_with_replacement(self.analysis.model.parts, 2)))
+        powers = [number for number, one in enumerate(self.analysis.bipolar_scan.elements) if one.kind == "cross"]
+        found = np.array(powers, dtype=np.int64).reshape(each, -1)
+        ranges = min(found.shape[1], len(self.drawn) // (2 * each))
+        return found[:, found.shape[1] - ranges :]
+
+    @cached_property
+    def null(self) -> SimulatedGaussian:
+        """Return the distribution of these powers."""
+        return SimulatedGaussian.from_simulations(self.drawn[:, self.rows.ravel()])
+
+    @cached_property
+    def responses(self) -> Matrix:
+        """Return their responses to the correlation of each pair, shape (powers, pairs)."""
+        elements = self.analysis.bipolar_scan.elements
+        return _responses_of_powers(self.analysis, self.pairs, [elements[row].ell or (0, -1) for row in self.rows[0]])
+
+
+def shared_noise(
+    powers: CrossPowers, null: SimulatedGaussian, level: float, x: Vector, bipolar_scan: Vector
+) -> SharedNoise | None:
     """Return the noise in common that explains data vector and cross powers of residuals; None if none does.
 
-    Correlations of all pairs of maps are fitted to the powers together, of which the simulations of the bipolar scan
-    tell the scatter: those of the highest ranges of degrees, of so many as these suffice for. What of them is FAINT is
-    left out of the fit to the data vector.
+    Correlations of all pairs of maps are fitted to the powers together. What of them is FAINT is left out of the fit to
+    the data vector, of the distribution ``null``. Fits have a p-value above ``level``.
     """
-    analysis, drawn, level = context.analysis, context.ensemble.bipolar_scan, context.settings.residual_level
-    parts = range(len(analysis.model.parts))
-    each = list(combinations_with_replacement(parts, 2))
-    pairs = [pair for pair in combinations(parts, 2) if _white(analysis, pair)]
-    found = [number for number, one in enumerate(analysis.bipolar_scan.elements) if one.kind == "cross"]
-    ranges = min(len(found) // len(each), len(drawn) // (2 * len(each)))
-    if not (ranges and pairs):
+    if not (powers.rows.size and powers.pairs):
         return None
-    rows = np.reshape(found, (len(each), -1))[:, -ranges:].ravel()
-    null, y = SimulatedGaussian.from_simulations(drawn[:, rows]), bipolar_scan[rows]
-    z = np.abs(y - null.mean) / drawn[:, rows].std(axis=0)
-    if z.max() < NEARLY:
+    y = bipolar_scan[powers.rows.ravel()]
+    if np.max(np.abs(y - powers.null.mean) / powers.drawn[:, powers.rows.ravel()].std(axis=0)) < NEARLY:
         return None
-    ends = [analysis.bipolar_scan.elements[row].ell or (0, -1) for row in rows[:ranges]]
-    fit = null.fit(y, _responses_of_powers(analysis, pairs, ends))
+    fit = powers.null.fit(y, powers.responses)
     size = np.abs(fit.amplitudes) / np.maximum(fit.errors, 1e-300)
-    certain = 2.0 * stats.t.sf(size * np.sqrt(fit.dof / (fit.dof - 2.0)), fit.dof) * len(pairs) <= LEVEL
+    p = 2.0 * stats.t.sf(size * np.sqrt(fit.dof / (fit.dof - 2.0)), fit.dof)
+    certain = p * len(powers.pairs) <= LEVEL
     if not certain.any() or fit.pvalue <= level:
         return None
     taken = np.flatnonzero(certain | (size > FAINT))
-    t = np.stack([_response(analysis, pairs[number]) for number in taken], axis=1)
-    whole = context.null.fit(x, t)
+    t = np.stack([_response(powers.analysis, powers.pairs[number]) for number in taken], axis=1)
+    whole = null.fit(x, t)
     if whole.pvalue <= level:
         return None
     both = np.array([[fit.amplitudes[taken], fit.errors[taken]], [whole.amplitudes, whole.errors]])
     better = both[np.argmin(both[:, 1], axis=0), :, np.arange(len(taken))][certain[taken]]
-    told = tuple(pairs[number] for number in np.flatnonzero(certain))
+    told = tuple(powers.pairs[number] for number in np.flatnonzero(certain))
     return SharedNoise(told, better[:, 0], better[:, 1], whole.pvalue)
 
 
