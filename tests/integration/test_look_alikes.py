@@ -32,10 +32,10 @@ def known():
     return context(analysis, *campaign.learned(analysis, ask, 260, time_ordered=False))
 
 
-@pytest.mark.parametrize(("seed", "alone"), [(1024, False), (1029, False), (1017, True)])
+@pytest.mark.parametrize(("seed", "alone"), [(1008, False), (1029, False), (1017, True)])
 def test_a_ring_in_one_channel_is_not_called_the_opposite_ring_in_the_other_alone(known, seed, alone):
-    # With the first two seeds parts of the data contradict the ring that is there, by odds of 30 and 39 of one of four
-    # comparisons; with the last one they contradict its twin, with p = 0.007.
+    # With the first seed parts of the data contradict the twin, by odds of 69 of one of four comparisons, with the
+    # second the ring that is there, by 43; with the last one the largest scales contradict the twin (p = 0.00085).
     data = data_of(known.run, "beam_sidelobe", "W1", seed=seed, amplitude=0.0018, calibrated="dipole")
     found = diagnose_data(ObservedMaps(known, list(simulate.maps(data, 0)), ask), "twins")
     names = {tuple((one.name, one.channel) for one in own.effects) for own in found.sets}
@@ -48,7 +48,7 @@ def test_a_ring_in_one_channel_is_not_called_the_opposite_ring_in_the_other_alon
     assert best.amplitude == pytest.approx(0.0018, abs=3.0 * best.sigma)
 
 
-@pytest.mark.parametrize("seed", [1024, 1029])
+@pytest.mark.parametrize("seed", [1008, 1029])
 def test_odds_that_one_of_four_comparisons_has_by_chance_doubt_nothing(known, seed):
     known = with_settings(known, absence_odds=DiagnosisSettings().absence_odds)
     data = data_of(known.run, "beam_sidelobe", "W1", seed=seed, amplitude=0.0018, calibrated="dipole")
