@@ -25,7 +25,7 @@ from mcsim.systematics import if_possible
 STANDS_OUT = 1e-6  #: probability up to which what stands out of a residual map is no chance
 PLACES = 5  #: of a map that a sentence has room for
 MASK_THEM = (
-    "Glitches, sources and the Galaxy look so, and no effect on beam, gain or noise does: "
+    "Glitches, sources and the Galaxy look so, and no effect on beam or gain does: "
     "leave these pixels out and diagnose the maps again."
 )
 
@@ -236,8 +236,8 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         maps = self._standardised(coarse)
         if ensemble.nuisances is not None:
             precision = np.stack([part.precision for part in self.context.analysis.model.parts])
-            variance = healpy.ud_grade(precision, healpy.npix2nside(npix)).reshape(coarse.shape)
-            maps = (coarse - ensemble.residual_mean) * divided(1.0, np.sqrt(variance), np.nan)
+            weight = healpy.ud_grade(precision, healpy.npix2nside(npix)).reshape(coarse.shape)  # residuals have it
+            maps = (coarse - ensemble.residual_mean) * divided(1.0, np.sqrt(weight), np.nan)
         return outstanding(maps, len(ensemble.bipolar_scan), STANDS_OUT)
 
     @cached_property
