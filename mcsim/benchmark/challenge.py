@@ -18,8 +18,8 @@ from mcsim.config.load import to_toml
 from mcsim.datavector.campaign import Batch, seeded, with_effects
 from mcsim.datavector.map_checks import of_pixel_means, read_maps
 from mcsim.datavector.out_of_library import library_with, responses
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.ensemble.maps import POINTING, file_names, write_map
 from mcsim.ensemble.runner import Workers
 from mcsim.errors import InputError

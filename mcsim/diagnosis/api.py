@@ -33,11 +33,11 @@ from mcsim.datavector.spectra_table import read_spectra
 from mcsim.diagnosis import controls, report, unlisted, words
 from mcsim.diagnosis.agreement import agreement
 from mcsim.diagnosis.context import DataSet, DiagnosisContext, context
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.measured_spectra import MeasuredSpectra
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.output import check_outside, check_replaced, digest
 from mcsim.diagnosis.result import DiagnosisResult
+from mcsim.diagnosis.verdict import diagnosed
 from mcsim.ensemble.external import ExternalModel, loaded
 from mcsim.ensemble.external_maps import Source
 from mcsim.ensemble.runner import Workers, load_ahead
@@ -135,7 +135,7 @@ def diagnose(
             found: DataSet = ObservedMaps(known, maps, ask) if table is None else MeasuredSpectra(known, table, ask)
             if source is not None:
                 campaign.check_data(found.x, ensemble, source)
-            diagnosis = diagnose_data(found, str(case or run.name))
+            found, diagnosis = diagnosed(found, str(case or run.name))
         if diagnosis.kind == "unknown" and isinstance(found, ObservedMaps) and source is None and not diagnosis.orders:
             with asking(call, quiet, simulated_scores.scores, "simulations of what is not listed") as ask:
                 diagnosis = unlisted.reconstructed(diagnosis, found, ask)

@@ -224,18 +224,12 @@ class DataSet(ABC, Generic[Data]):
         """Return sentences on what describes the data and is no effect: noise in common, or another order of maps."""
         return (self.noise_in_common if self.gap.pvalue <= self.context.settings.alpha else []) or self.exchanged
 
-    @property
-    def x_without_places(self) -> Vector | None:
-        """Return the data vector of maps without the pixels of places that stand out; None if it cannot be had."""
-        return None
+    def without_bad_pixels(self, found: Sequence[config.Effect]) -> tuple["DataSet | None", list[str]]:
+        """Return the data without places that stand out beside what effects add, and sentences on these.
 
-    def stands_out_beside(self, found: Sequence[config.Effect]) -> bool:
-        """Return True if places of maps stand out that are not what effects add to them."""
-        return False
-
-    def notes(self) -> list[str]:
-        """Return sentences on the data."""
-        return []
+        They are the data themselves if none does, None if those are more than may be left out.
+        """
+        return self, []
 
     def residual_maps(self) -> Matrix | None:
         """Return the residual maps over the scatter of those of simulations, shape (map, npix); None without maps."""

@@ -13,8 +13,8 @@ from mcsim.datavector.campaign import Batch, asking
 from mcsim.datavector.faithful import draw, fidelity
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.control_result import Control, Controls
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.ensemble.plan import cost
 from mcsim.errors import InputError, RunError
 from mcsim.support import folders

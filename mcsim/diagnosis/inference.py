@@ -1,7 +1,7 @@
 """Infer from one data set whether, where, by which effects and how far it departs from the model."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -15,8 +15,8 @@ from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import as_seen
 from mcsim.diagnosis.found_noise import in_words, with_found_noise
-from mcsim.diagnosis.naming import agreeing, leaves_places, unconfirmed
-from mcsim.diagnosis.partial import PartialSearch
+from mcsim.diagnosis.naming import agreeing, unconfirmed
+from mcsim.diagnosis.partial import PartialExplanation, PartialSearch
 from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.rivals import with_rivals
@@ -33,12 +33,54 @@ from mcsim.systematics import acts_through, if_possible
 EXPLAINED = 0.5  #: share of the excess chi^2 that a single effect explains which is more likely than an exchange
 
 
-def diagnose_data(data: DataSet, case: str) -> DiagnosisResult:
-    """Diagnose observed maps or measured spectra; raise InputError if they cannot be what they claim to be."""
+@dataclass(frozen=True, eq=False)
+class Inferred:
+    """Hold what data say: with which data that is found, and what is reported of it."""
+
+    data: DataSet
+    refined: Refined
+    reduction: HeldOut | None = None
+    notes: tuple[str, ...] = ()
+    orders: tuple[str, ...] = ()
+
+    @property
+    def best(self) -> Explanation | PartialExplanation | None:
+        """Return the best set, or else what is detected."""
+        return next(iter(self.refined.attribution.explanations), self.refined.partial)
+
+    @property
+    def acting(self) -> list[config.Effect]:
+        """Return the effects of :attr:`best`, if they can act."""
+        with if_possible():
+            return tables_at(self.data.context.candidates, self.best.members, self.best.fit) if self.best else []
+        return []
+
+    @property
+    def has_glitches(self) -> bool:
+        """Return True if noise in excess of the model's is among these, which may be a few strong glitches."""
+        members = self.best.members if self.best else ()
+        return any(acts_through(self.data.context.candidates[member].effect, "excess") for member in members)
+
+    def unexplained(self) -> "Inferred":
+        """Return the same without what was named or detected."""
+        found = self.refined.attribution
+        if found.verdict == "none":
+            return self
+        left = replace(found.unexplained(), contradicted=(*found.contradicted, *found.explanations))
+        return replace(self, refined=replace(self.refined, attribution=left, partial=None), reduction=None)
+
+    def result(self, case: str, *notes: str) -> DiagnosisResult:
+        """Return the result of a case, with notes before its own."""
+        said = (*notes, *self.notes)
+        return replace(result_of(self.data, case, self.refined, self.reduction, said), orders=self.orders)
+
+
+def inferred(data: DataSet) -> Inferred:
+    """Return what data say as they are."""
     context = data.context
     if _is_no_effect(data, first := Refiner(data).unrefined()):
         first = replace(first, attribution=first.attribution.unexplained())
-        return replace(result_of(data, case, first, None, data.notes()), orders=tuple(data.instead))
+        return Inferred(data, first, orders=tuple(data.instead))
     t = data.templates()
     start = bent_templates(context.null, data.x, t, context.bank.curvature, context.candidates)
     refined = Refiner(data).run(t, context.candidates, start=start)
@@ -52,7 +94,7 @@ def diagnose_data(data: DataSet, case: str) -> DiagnosisResult:
         data, refined, found, refusals = _compared(data, refined)
         if data.context.noise and found.explanations and not _has_noise(refined, found):
             data, refined, found, refusals = _compared(*plain)  # noise that is not there hides what is left
-    notes = [*in_words(data.context), *data.notes()]
+    notes = in_words(data.context)
     context, detected = data.context, refined.partial
     if instead:
         found, detected = found.unexplained(), None
@@ -68,15 +110,13 @@ def diagnose_data(data: DataSet, case: str) -> DiagnosisResult:
     searched = instead or refusals or found.faint or refined.attribution.verdict == "unknown"
     if found.verdict == "unknown" and not searched:
         detected = PartialSearch(data).run(refined.templates, refined.candidates)
-    if detected is not None and leaves_places(data, detected.templates, detected):
-        detected = None
     notes += refusals
     if found.verdict == "none":
         notes += data.noise_in_common
     for own in found.explanations[:1] if detected is None else [detected]:
         notes += as_seen(context, own.members, own.fit)
     refined = replace(refined, attribution=found, partial=detected)
-    return replace(result_of(data, case, refined, reduction, notes), orders=tuple(instead))
+    return Inferred(data, refined, reduction, tuple(notes), tuple(instead))
 
 
 def _compared(data: DataSet, refined: Refined) -> tuple[DataSet, Refined, Attribution, list[str]]:

@@ -5,16 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from mcsim import config
-from mcsim.datavector.candidate import Candidate, columns_of, parts_of, tables_at
+from mcsim.datavector.candidate import Candidate, parts_of
 from mcsim.diagnosis.consistency import Action, Slices, contradiction
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import is_drawn
-from mcsim.diagnosis.partial import PartialExplanation
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import Attribution, Explanation
-from mcsim.support.arrays import Matrix, Vector
-from mcsim.systematics import acts_through, if_possible
+from mcsim.support.arrays import Matrix
+from mcsim.systematics import if_possible
 
 
 def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attribution, list[str]]:
@@ -22,7 +20,6 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
 
     The effects of a set are simulated at their amplitudes, and these are compared in parts of the data. An effect whose
     pattern on the sky is drawn has no such response: it is told from other signals on the sky by its frequencies alone.
-    Nor is a set named that places which stand out of the residual maps may have made (:func:`leaves_places`).
     Where another set agrees, one that parts contradict is not left out before it is ``odds_cut`` times less probable.
     What is left has to be as probable as ``named_probability`` asks for without what was left out.
     """
@@ -37,11 +34,6 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
     sentences: list[str] = []
     for one in found.explanations:
         members = [candidates[member] for member in one.members]
-        if leaves_places(data, refined.templates, one):
-            refused.append(one)
-            why = "places of the residual maps stand out, without which it has less than half of its S/N"
-            sentences.append(f"The data vector fits {_title(candidates, one)}, which is not named: {why}.")
-            continue
         if any(map(is_drawn, members)):
             if len(frequencies) == 1:
                 refused.append(one)
@@ -72,30 +64,6 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
         sentences.append(f"The data vector fits {sets}, which is not named: {why}.")
         left = replace(left.unexplained(), contradicted=(*refused, *left.explanations))
     return left, sentences
-
-
-def leaves_places(data: DataSet, t: Matrix, one: Explanation | PartialExplanation) -> bool:
-    """Return True if places of the residual maps stand out that may be why a set fits: by its templates ``t``, (p, K).
-
-    They are not what it adds to the maps, and without their pixels some member has less than half of its S/N. Noise
-    in excess of the model's may be a few strong glitches.
-    """
-    candidates, acting = data.context.candidates, list[config.Effect]()
-    if any(acts_through(candidates[member].effect, "excess") for member in one.members):
-        return False
-    with if_possible():
-        acting = tables_at(candidates, one.members, one.fit)
-    if not data.stands_out_beside(acting):
-        return False
-    if (x := data.x_without_places) is None:
-        return True
-
-    def snrs(x: Vector) -> list[float]:
-        found = data.context.null.fit(x, t[:, columns_of(candidates, one.members)])
-        parts = parts_of(candidates, one.members, found)
-        return [float(np.sqrt(theta @ np.linalg.pinv(covariance) @ theta)) for _, theta, covariance in parts]
-
-    return any(left < 0.5 * own for own, left in zip(snrs(data.x), snrs(x), strict=True))
 
 
 def _is_as_probable(one: Explanation, agreed: Sequence[Explanation], cut: float) -> bool:

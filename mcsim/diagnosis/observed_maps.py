@@ -1,7 +1,7 @@
 """Observed maps: read them, refuse what the model cannot describe, and prepare them for a diagnosis."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 
@@ -9,25 +9,17 @@ import healpy
 import numpy as np
 
 from mcsim import config
-from mcsim.datavector.bipolar_scan import coarse_residuals
 from mcsim.datavector.candidate import Candidate
-from mcsim.datavector.localisation import Place, outstanding, places, standardised
+from mcsim.datavector.localisation import Place, places
 from mcsim.datavector.map_checks import exchanges, share_left_out
 from mcsim.datavector.nuisances import half_given_other
 from mcsim.datavector.same_skies import SameSkies, Skies
-from mcsim.datavector.wiener_filter import wiener_filter
+from mcsim.diagnosis.bad_pixels import bad_pixels, residual_maps, standing_out
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.output import DIGEST, digest
 from mcsim.diagnosis.shared_noise import shared_noise
-from mcsim.support.arrays import Map, Matrix, Vector, divided
+from mcsim.support.arrays import Map, Matrix, Vector
 from mcsim.systematics import if_possible
-
-STANDS_OUT = 1e-6  #: probability up to which what stands out of a residual map is no chance
-PLACES = 5  #: of a map that a sentence has room for
-MASK_THEM = (
-    "Glitches, sources and the Galaxy look so, and no effect on beam or gain does: "
-    "leave these pixels out and diagnose the maps again."
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +28,8 @@ class ObservedMaps(DataSet[Sequence[Map]]):
 
     Responses to effects are simulated in skies that the filtered maps constrain.
     """
+
+    given: Sequence[Map] = ()  # with pixels that were left out since; (): all are there
 
     @cached_property
     def _measured(self) -> tuple[Vector, Vector, Map, Vector]:
@@ -219,63 +213,18 @@ class ObservedMaps(DataSet[Sequence[Map]]):
 
     def residual_maps(self) -> Matrix:
         """Return the residual maps over the scatter of those of simulations, shape (map, npix)."""
-        return self._standardised(self._measured[2])
+        return residual_maps(self.context, self._measured[2])
 
-    def _standardised(self, coarse: Map) -> Matrix:
-        ensemble = self.context.ensemble
-        drawn = len(ensemble.bipolar_scan)
-        return standardised(coarse, ensemble.residual_mean, ensemble.residual_scatter, drawn)
-
-    def _outstanding(self, coarse: Map) -> dict[int, dict[int, float]]:
-        """Return what stands out of residual maps, (map, npix).
-
-        What nuisances scatter is large in some places, beside which others would stand out that have it not: then
-        residuals count over the noise alone.
-        """
-        ensemble, npix = self.context.ensemble, coarse.shape[1]
-        maps = self._standardised(coarse)
-        if ensemble.nuisances is not None:
-            precision = np.stack([part.precision for part in self.context.analysis.model.parts])
-            weight = healpy.ud_grade(precision, healpy.npix2nside(npix)).reshape(coarse.shape)  # residuals have it
-            maps = (coarse - ensemble.residual_mean) * divided(1.0, np.sqrt(weight), np.nan)
-        return outstanding(maps, len(ensemble.bipolar_scan), STANDS_OUT)
-
-    @cached_property
-    def x_without_places(self) -> Vector | None:
-        """Return the data vector of the maps without the pixels of places that stand out; None if they are many."""
-        model, maps, coarse = self.context.analysis.model, list(self.data), self._measured[2]
-        for number, sizes in self._outstanding(coarse).items():
-            there = np.isin(np.arange(coarse.shape[1]), list(sizes))
-            hidden = healpy.ud_grade(there.astype(float), model.nside) > 0.0
-            maps[number] = np.where(hidden, healpy.UNSEEN, maps[number])
-        shares = map(share_left_out, model.parts, maps)
-        return None if max(shares) > self.context.settings.missing_share else self.context.analysis.data_vector(maps)
-
-    def stands_out_beside(self, found: Sequence[config.Effect]) -> bool:
-        """Return True if places of the residual maps stand out that are not what effects add to the maps."""
-        if not self._outstanding(self._measured[2]):
-            return False
+    def without_bad_pixels(self, found: Sequence[config.Effect]) -> tuple["ObservedMaps | None", list[str]]:
+        """Return the maps without places that stand out beside what effects add, and sentences on these."""
+        if not standing_out(self.context, self._measured[2]):
+            return self, []
+        if (bad := bad_pixels(self.context, self.data, self.same_skies.less_added(found))) is None:
+            return self, []
         model = self.context.analysis.model
-        filtered = wiener_filter(model, self.same_skies.less_added(found))
-        return bool(self._outstanding(coarse_residuals(model, filtered)))
-
-    def notes(self) -> list[str]:
-        """Return a sentence on each map of whose residual places stand out as no effect lets them, and a remedy."""
-        maps, model, said = self.residual_maps(), self.context.analysis.model, list[str]()
-        nside = healpy.npix2nside(maps.shape[1])
-        for number, pixels in self._outstanding(self._measured[2]).items():
-            beside = {one: pixels.keys() & set(healpy.get_all_neighbours(nside, one).tolist()) for one in pixels}
-            sizes = {one: size for one, size in pixels.items() if all(pixels[near] < size for near in beside[one])}
-            each = [healpy.pix2ang(nside, pixel, lonlat=True) for pixel in sizes]
-            where = [f"longitude {round(lon) % 360}°, latitude {round(lat)}°".replace("-", "−") for lon, lat in each]
-            where[PLACES:] = [f"{len(where) - PLACES} more"] * (len(where) > PLACES)
-            name, size = model.parts[number].name, f"{max(sizes.values()):.0f} times its scatter"
-            start = f"One place of the residual of {name} stands out, {size}"
-            if len(sizes) > 1:
-                start = f"{len(sizes)} places of the residual of {name} stand out, up to {size}"
-            said.append(f"{start}: {'; '.join(where)} ({model.frame}).")
-        return [*said, MASK_THEM] if said else []
+        left = None if bad.maps is None else replace(self, data=bad.maps, given=self.given or self.data)
+        return left, bad.sentences([part.name for part in model.parts], model.frame)
 
     def provenance(self) -> dict[str, str | int]:
-        """Return the hash of the maps."""
-        return {DIGEST: digest(self.data)}
+        """Return the hash of the maps as they were given."""
+        return {DIGEST: digest(self.given or self.data)}

@@ -20,9 +20,9 @@ from mcsim.datavector.shared_sky import shared_sky
 from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.diagnosis import api, inference, words
 from mcsim.diagnosis.context import context
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.ensemble.maps import POINTING, file_names, write_map
 from mcsim.errors import InputError
 from mcsim.reconstruction.result import HEAD

@@ -1,4 +1,4 @@
-"""Places that stand out of residual maps: they are said, and nothing is named that does not add them."""
+"""Bad pixels: they are said and left out, and what is left is diagnosed, unless what is named adds them."""
 
 from dataclasses import dataclass, replace
 
@@ -9,8 +9,9 @@ import pytest
 from instruments import ask, data_of, learned, learned_small, two_channels
 from mcsim import config, systematics
 from mcsim.datavector.campaign import with_effects
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.output import DIGEST
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere import healpix
@@ -34,6 +35,11 @@ class HotSpot(systematics.Effect):
         return sky + self.amplitude * healpix.analysis(spot, site.lmax)
 
 
+def left_out(data, *found):
+    """Return the sentences on places that stand out beside effects."""
+    return data.without_bad_pixels(found)[1]
+
+
 @pytest.fixture(scope="module")
 def small():
     return learned_small()
@@ -46,7 +52,7 @@ def shared(small):
 
 def test_perfect_maps_have_no_such_places(small, shared):
     """By chance one of a million has: those of twelve skies."""
-    assert not any(ObservedMaps(small, list(simulate.maps(shared, r)), ask).notes() for r in range(12))
+    assert not any(left_out(ObservedMaps(small, list(simulate.maps(shared, r)), ask)) for r in range(12))
 
 
 def test_bad_pixels_of_one_map_are_named_nothing(small, shared):
@@ -58,12 +64,11 @@ def test_bad_pixels_of_one_map_are_named_nothing(small, shared):
     found = diagnose_data(ObservedMaps(small, changed, ask), "glitches")
     assert (found.kind, found.sets) == ("unknown", ())
     assert [effect.name for one in found.contradicted for effect in one.effects] == ["noise_level"]
-    first, remedy, *_, refusal = found.verdict["notes"]
+    first, rest = found.verdict["notes"]
     assert f"4 places of the residual of {shared.map_names[2]} stand out, up to" in first
     for lon, lat in zip(*healpy.pix2ang(16, bad, lonlat=True), strict=True):
         assert f"longitude {lon:.0f}°, latitude {lat:.0f}°".replace("-", "−") in first
-    assert "leave" in remedy
-    assert "noise level of W1" in refusal
+    assert "Without these pixels the model fits (p = 0." in rest
 
 
 def test_what_explains_a_part_of_bad_pixels_is_not_detected(small, shared):
@@ -80,10 +85,9 @@ def test_what_adds_a_place_may_be_named(small, shared):
     spot = config.Effect(name="hot_spot", channel="W1", parameters={"amplitude": 400.0})
     hot = survey(with_effects(shared.config, [spot]), library=library)
     data = ObservedMaps(known, list(simulate.maps(hot, 5)), ask)
-    assert data.notes()
-    assert data.stands_out_beside([])
-    assert data.stands_out_beside([config.Effect(name="dipole_residual", channel="W1", parameters={"amplitude": 3.0})])
-    assert not data.stands_out_beside([spot])
+    assert left_out(data)
+    assert left_out(data, config.Effect(name="dipole_residual", channel="W1", parameters={"amplitude": 3.0}))
+    assert not left_out(data, spot)
 
 
 def test_what_a_nuisance_leaves_alone_does_not_stand_out():
@@ -95,14 +99,22 @@ def test_what_a_nuisance_leaves_alone_does_not_stand_out():
     plain = replace(run, nuisances=())
     for seed in range(900, 906):
         maps = list(simulate.maps(data_of(plain, seed=seed), 0))
-        assert ObservedMaps(known, maps, ask).notes() == []
+        assert left_out(ObservedMaps(known, maps, ask)) == []
     maps[2][SPOT] += 20.0 * data_of(plain).maps[2].noise_uk[SPOT]
-    (place, _) = ObservedMaps(known, maps, ask).notes()
+    (place,) = left_out(ObservedMaps(known, maps, ask))
     assert place.startswith("One place of the residual of W1:half1 stands out")
 
 
+def test_one_bright_pixel_is_said_of_its_own_map_alone(small, shared):
+    """It is in the sky that all maps share: every map was said to have places."""
+    maps = [map_uk.copy() for map_uk in simulate.maps(shared, 3)]
+    maps[1][SPOT] += 500.0 * shared.maps[1].noise_uk[SPOT]
+    rest, (place,) = ObservedMaps(small, maps, ask).without_bad_pixels([])
+    assert place.startswith(f"One place of the residual of {shared.map_names[1]} stands out")
+    assert [int(np.sum(one == healpy.UNSEEN)) for one in rest.data] == [0, 1, 0, 0]
+
+
 def test_a_strong_effect_is_named_beside_a_bad_pixel_of_another_map(small):
-    """The pixel is not why it fits: without it the S/N is the same."""
     found = data_of(small.run, "beam_ellipticity", "W1", amplitude=0.3, angle_deg=20.0)
     maps = [map_uk.copy() for map_uk in simulate.maps(found, 4)]
     maps[0][1000] += 12.0 * found.maps[0].noise_uk[1000]
@@ -110,3 +122,29 @@ def test_a_strong_effect_is_named_beside_a_bad_pixel_of_another_map(small):
     assert [(one.name, one.channel) for one in told.effects] == [("beam_ellipticity", "W1")]
     assert abs(told.effects[0].amplitude - 0.3) < 4.0 * told.effects[0].sigma
     assert f"One place of the residual of {found.map_names[0]}" in told.notes[0]
+
+
+def test_what_bad_pixels_hide_is_named_without_them(small):
+    """Maps with them were *unknown*: what acts beside them did not explain the rest."""
+    found = data_of(small.run, "beam_ellipticity", "W1", amplitude=0.3, angle_deg=20.0)
+    maps = [map_uk.copy() for map_uk in simulate.maps(found, 4)]
+    given = diagnose_data(ObservedMaps(small, maps, ask), "given")
+    bad = [300, 1000, 1700, 2400]
+    maps[0][bad] += np.array([60.0, -80.0, 40.0, 100.0]) * found.maps[0].noise_uk[bad]
+    data = ObservedMaps(small, maps, ask)
+    told = diagnose_data(data, "both")
+    assert [(one.name, one.channel) for one in told.effects] == [("beam_ellipticity", "W1")]
+    assert abs(told.effects[0].amplitude - given.effects[0].amplitude) < 0.5 * told.effects[0].sigma
+    assert told.notes[0].startswith(f"4 places of the residual of {found.map_names[0]} stand out")
+    assert "left out" in told.notes[1]
+    assert told.provenance[DIGEST] == data.provenance()[DIGEST]
+
+
+def test_nothing_is_named_beside_more_bad_pixels_than_may_be_left_out(small, shared):
+    rng = np.random.default_rng(4)
+    bad = rng.choice(3072, 60, replace=False)
+    maps = [map_uk.copy() for map_uk in simulate.maps(shared, 2)]
+    maps[2][bad] += rng.choice([-30.0, 30.0], 60) * shared.maps[2].noise_uk[bad]
+    found = diagnose_data(ObservedMaps(small, maps, ask), "glitches")
+    assert (found.kind, found.sets, found.partial) == ("unknown", (), ())
+    assert "map.mask" in found.notes[1]

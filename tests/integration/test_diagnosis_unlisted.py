@@ -12,9 +12,9 @@ import pytest
 from instruments import ask, data_of, learned_small, scored
 from mcsim import systematics
 from mcsim.diagnosis import report, unlisted, words
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.reconstruction import simulated_scores
 from mcsim.simulation import simulate
 from mcsim.sphere import real

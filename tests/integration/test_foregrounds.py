@@ -12,8 +12,8 @@ from mcsim.datavector import campaign
 from mcsim.datavector.analysis import Analysis, analysis_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.context import DiagnosisContext, context
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.simulation import simulate
 from mcsim.stats.look_elsewhere import global_test
 

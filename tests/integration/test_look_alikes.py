@@ -10,8 +10,8 @@ from mcsim.datavector import campaign
 from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.context import context
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.simulation import simulate
 
 PROPOSED = ("beam_sidelobe", "beam_ellipticity", "noise_level")

@@ -19,9 +19,9 @@ from mcsim.datavector.nuisances import Regression
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import api, report, words
 from mcsim.diagnosis.context import context
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.ensemble.maps import file_names
 from mcsim.simulation import simulate
 from mcsim.simulation.nuisance import draws, tables

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from instruments import ask, data_of, learned, two_channels
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.simulation import simulate
 
 

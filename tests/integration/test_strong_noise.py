@@ -6,8 +6,8 @@ import pytest
 from instruments import ask, learned, two_channels
 from mcsim import config
 from mcsim.datavector.campaign import with_effects
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 

@@ -7,8 +7,8 @@ from instruments import ask, data_of, learned, scored, two_channels
 from mcsim import config
 from mcsim.datavector.campaign import with_effects
 from mcsim.diagnosis import unlisted
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.reconstruction import simulated_scores
 from mcsim.reconstruction.fitted_nuisances import FittedNuisances
 from mcsim.simulation import simulate

@@ -6,8 +6,8 @@ import pytest
 
 from instruments import ask, data_of, learned_small, scored
 from mcsim.diagnosis import unlisted
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.simulation import simulate
 from mcsim.sphere import rng
 

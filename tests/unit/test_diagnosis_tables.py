@@ -19,9 +19,9 @@ from mcsim.datavector.spectra_table import read_spectra
 from mcsim.datavector.summaries import Element
 from mcsim.diagnosis import api, report
 from mcsim.diagnosis.context import context
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.measured_spectra import MeasuredSpectra
 from mcsim.diagnosis.naming import slices_of
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotate_biposh

@@ -23,9 +23,9 @@ from mcsim.datavector.campaign import asking, batch, seeded, with_effects
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.context import DiagnosisContext
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.selection import Selection, attribute
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.simulation import sampled
 from mcsim.simulation.survey import survey
 from mcsim.stats.intervals import share

@@ -34,8 +34,8 @@ from mcsim.datavector.nuisances import Regression
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.context import DiagnosisContext
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.simulation import nuisance, simulate
 from mcsim.simulation.survey import survey
 from mcsim.stats.look_elsewhere import global_test

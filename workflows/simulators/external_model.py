@@ -23,8 +23,8 @@ from mcsim.datavector import campaign
 from mcsim.datavector.analysis import analysis_of, data_vectors
 from mcsim.diagnosis.agreement import agreement
 from mcsim.diagnosis.context import context
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.ensemble.external import source_of
 from mcsim.sphere import spectra
 from mcsim.stats.look_elsewhere import global_test

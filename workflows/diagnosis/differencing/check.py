@@ -31,9 +31,9 @@ from mcsim.datavector.campaign import asking, batch, with_effects
 from mcsim.diagnosis import controls
 from mcsim.diagnosis.api import prepared
 from mcsim.diagnosis.context import DiagnosisContext
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.result import DiagnosisResult
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.stats.look_elsewhere import global_test

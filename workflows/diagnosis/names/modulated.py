@@ -10,8 +10,8 @@ import numpy as np
 from names import MODEL, ask, learned
 
 from mcsim.datavector.campaign import seeded, with_effects
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 

@@ -25,8 +25,8 @@ from mcsim.datavector.analysis import analysis_of, data_vectors
 from mcsim.datavector.campaign import seeded, with_effects
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.api import prepared
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotation_matrix

@@ -23,8 +23,8 @@ from names import KINDS, MODEL, ONE, STRENGTHS, ask, learned, systematic
 from mcsim.datavector.campaign import with_effects
 from mcsim.datavector.candidate import Candidate
 from mcsim.diagnosis import unlisted
-from mcsim.diagnosis.inference import diagnose_data
 from mcsim.diagnosis.observed_maps import ObservedMaps
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.reconstruction import simulated_scores
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
