@@ -10,6 +10,7 @@ import numpy as np
 
 from mcsim import config
 from mcsim.datavector.analysis import Analysis
+from mcsim.datavector.bad_pixels import BadPixels
 from mcsim.datavector.campaign import Ask, after_jobs, without_repeats
 from mcsim.datavector.candidate import Candidate, TemplateBank
 from mcsim.datavector.halves import Halves
@@ -224,12 +225,13 @@ class DataSet(ABC, Generic[Data]):
         """Return sentences on what describes the data and is no effect: noise in common, or another order of maps."""
         return (self.noise_in_common if self.gap.pvalue <= self.context.settings.alpha else []) or self.exchanged
 
-    def without_bad_pixels(self, found: Sequence[config.Effect]) -> tuple["DataSet | None", list[str]]:
-        """Return the data without places that stand out beside what effects add, and sentences on these.
+    def bad_pixels(self, found: Sequence[config.Effect]) -> BadPixels | None:
+        """Return places of the data that stand out beside what effects add to them, None if there are none."""
+        return None
 
-        They are the data themselves if none does, None if those are more than may be left out.
-        """
-        return self, []
+    def without(self, bad: BadPixels) -> "DataSet | None":
+        """Return the data without bad pixels; None if these are more than may be left out."""
+        return self
 
     def residual_maps(self) -> Matrix | None:
         """Return the residual maps over the scatter of those of simulations, shape (map, npix); None without maps."""

@@ -34,7 +34,7 @@ def with_found_noise(data: DataSet, refined: Refined) -> tuple[DataSet, Refined]
     stay those from the model. The gap is tested as before.
     """
     model = data.context
-    if refined.attribution.verdict == "none" or model.analysis.source is not None or data.without_bad_pixels([])[1]:
+    if refined.attribution.verdict == "none" or model.analysis.source is not None or data.bad_pixels([]):
         return data, refined
     for _ in range(ROUNDS):
         pair = None

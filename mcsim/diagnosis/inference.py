@@ -16,7 +16,7 @@ from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import as_seen
 from mcsim.diagnosis.found_noise import in_words, with_found_noise
 from mcsim.diagnosis.naming import agreeing, unconfirmed
-from mcsim.diagnosis.partial import PartialExplanation, PartialSearch
+from mcsim.diagnosis.partial import PartialSearch
 from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.rivals import with_rivals
@@ -44,30 +44,22 @@ class Inferred:
     orders: tuple[str, ...] = ()
 
     @property
-    def best(self) -> Explanation | PartialExplanation | None:
-        """Return the best set, or else what is detected."""
-        return next(iter(self.refined.attribution.explanations), self.refined.partial)
+    def best(self) -> tuple[tuple[int, ...], Fit]:
+        """Return members and fit of the best set, or else of what is detected, or of what explains most by itself."""
+        found, detected = self.refined.attribution, self.refined.partial
+        if found.explanations:
+            return found.explanations[0].members, found.explanations[0].fit
+        if detected is not None:
+            return detected.members, detected.fit
+        index = max(range(len(found.singles)), key=lambda k: found.singles[k].delta_chi2)
+        return (index,), found.singles[index]
 
     @property
     def acting(self) -> list[config.Effect]:
-        """Return the effects of :attr:`best`, if they can act."""
+        """Return the effects of :attr:`best` at their amplitudes; none if they cannot act."""
         with if_possible():
-            return tables_at(self.data.context.candidates, self.best.members, self.best.fit) if self.best else []
+            return tables_at(self.data.context.candidates, *self.best)
         return []
-
-    @property
-    def has_glitches(self) -> bool:
-        """Return True if noise in excess of the model's is among these, which may be a few strong glitches."""
-        members = self.best.members if self.best else ()
-        return any(acts_through(self.data.context.candidates[member].effect, "excess") for member in members)
-
-    def unexplained(self) -> "Inferred":
-        """Return the same without what was named or detected."""
-        found = self.refined.attribution
-        if found.verdict == "none":
-            return self
-        left = replace(found.unexplained(), contradicted=(*found.contradicted, *found.explanations))
-        return replace(self, refined=replace(self.refined, attribution=left, partial=None), reduction=None)
 
     def result(self, case: str, *notes: str) -> DiagnosisResult:
         """Return the result of a case, with notes before its own."""

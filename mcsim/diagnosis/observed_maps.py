@@ -9,12 +9,12 @@ import healpy
 import numpy as np
 
 from mcsim import config
+from mcsim.datavector.bad_pixels import BadPixels, bad_pixels, residual_maps, standing_out
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.localisation import Place, places
 from mcsim.datavector.map_checks import exchanges, share_left_out
 from mcsim.datavector.nuisances import half_given_other
 from mcsim.datavector.same_skies import SameSkies, Skies
-from mcsim.diagnosis.bad_pixels import bad_pixels, residual_maps, standing_out
 from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.output import DIGEST, digest
 from mcsim.diagnosis.shared_noise import shared_noise
@@ -213,17 +213,22 @@ class ObservedMaps(DataSet[Sequence[Map]]):
 
     def residual_maps(self) -> Matrix:
         """Return the residual maps over the scatter of those of simulations, shape (map, npix)."""
-        return residual_maps(self.context, self._measured[2])
+        return residual_maps(self.context.ensemble, self._measured[2])
 
-    def without_bad_pixels(self, found: Sequence[config.Effect]) -> tuple["ObservedMaps | None", list[str]]:
-        """Return the maps without places that stand out beside what effects add, and sentences on these."""
-        if not standing_out(self.context, self._measured[2]):
-            return self, []
-        if (bad := bad_pixels(self.context, self.data, self.same_skies.less_added(found))) is None:
-            return self, []
-        model = self.context.analysis.model
-        left = None if bad.maps is None else replace(self, data=bad.maps, given=self.given or self.data)
-        return left, bad.sentences([part.name for part in model.parts], model.frame)
+    def bad_pixels(self, found: Sequence[config.Effect]) -> BadPixels | None:
+        """Return places of the maps that stand out beside what effects add to them."""
+        model, ensemble = self.context.analysis.model, self.context.ensemble
+        less = self.same_skies.less_added(found)
+        as_they_are = all(one is other for one, other in zip(less, self.data, strict=True))
+        if as_they_are and not standing_out(model, ensemble, self._measured[2])[0]:
+            return None
+        return bad_pixels(model, ensemble, less)
+
+    def without(self, bad: BadPixels) -> "ObservedMaps | None":
+        """Return the maps without bad pixels; None if these are more than may be left out."""
+        left, model = bad.without(self.data, self.context.analysis.model.nside), self.context.analysis.model
+        many = max(map(share_left_out, model.parts, left)) > self.context.settings.missing_share
+        return None if many else replace(self, data=left, given=self.given or self.data)
 
     def provenance(self) -> dict[str, str | int]:
         """Return the hash of the maps as they were given."""
