@@ -16,6 +16,7 @@ from mcsim.support.arrays import Map, Matrix, divided
 
 STANDS_OUT = 1e-6  #: probability up to which what stands out of a residual map is no chance
 NEARLY = 0.5  #: share of the size of the largest place from which on others are left out with it
+ALIKE = 0.9  #: share of what a place is in one map from which on it is as large in another, as in the only two maps
 SHOWN = 5  #: places of a map that a sentence has room for
 
 
@@ -108,11 +109,18 @@ def standing_out(model: Model, ensemble: NullEnsemble, coarse: Map) -> tuple[dic
 
 
 def _largest(found: dict[int, dict[int, float]], maps: Matrix) -> dict[int, dict[int, float]]:
-    """Return those of pixels that stand out which are nearly as large in residual maps, (map, npix), as any of them."""
+    """Return those of pixels that stand out which are nearly as large in residual maps, (map, npix), as any of them.
+
+    Of what stands out in several maps they are those of the map where it is largest, and of any where it is so alike.
+    """
     values = {number: np.abs(maps[number] - np.nanmedian(maps[number])) for number in found}
-    least = NEARLY * max((values[number][one] for number, sizes in found.items() for one in sizes), default=0.0)
+    most: dict[int, float] = {}
+    for number, sizes in found.items():
+        for one in sizes:
+            most[one] = max(float(values[number][one]), most.get(one, 0.0))
+    least = NEARLY * max(most.values(), default=0.0)
     large = {
-        number: {one: size for one, size in sizes.items() if values[number][one] >= least}
+        number: {one: size for one, size in sizes.items() if values[number][one] >= max(least, ALIKE * most[one])}
         for number, sizes in found.items()
     }
     return {number: sizes for number, sizes in large.items() if sizes}
