@@ -212,8 +212,11 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return places(np.concatenate([self._measured[1], shifted]), drawn, elements, self.context.settings.place_pvalue)
 
     def residual_maps(self) -> Matrix:
-        """Return the residual maps over the scatter of those of simulations, shape (map, npix)."""
-        return residual_maps(self.context.ensemble, self._measured[2])
+        """Return the residual maps over the scatter of those of simulations, shape (map, npix); NaN without data."""
+        maps = residual_maps(self.context.ensemble, self._measured[2])
+        there = [(one != healpy.UNSEEN).astype(float) for one in self.data]
+        share = np.reshape(healpy.ud_grade(there, healpy.npix2nside(maps.shape[1])), maps.shape)
+        return np.where(share > 0.0, maps, np.nan)
 
     def bad_pixels(self, found: Sequence[config.Effect]) -> BadPixels | None:
         """Return places of the maps that stand out beside what effects add to them."""

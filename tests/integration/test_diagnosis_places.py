@@ -149,6 +149,7 @@ def test_one_bright_pixel_is_said_of_its_own_map_alone(small, shared):
     (place,), rest = left_out(data), data.without(data.bad_pixels([]))
     assert place.startswith(f"One place of the residual of {shared.map_names[1]} stands out")
     assert [int(np.sum(one == healpy.UNSEEN)) for one in rest.data] == [0, 1, 0, 0]
+    assert [int(np.sum(np.isnan(one))) for one in rest.residual_maps()] == [0, 1, 0, 0]
 
 
 def test_a_strong_effect_is_named_beside_a_bad_pixel_of_another_map(small):
