@@ -331,9 +331,10 @@ def _contrast_blocks(model: Model) -> list[Block]:
     groups = [[c for c, f in enumerate(frequencies) if f == end] for end in (known[0], known[-1])]
     top = min(model.settings.large_scales, model.lmax)
     nside = 2 << max(top // 3, 1).bit_length() - 1
-    ranges = list(pairwise(model.settings.latitude_edges))
     height = np.abs(sine_of_latitude(model.frame, "galactic", nside))
-    bands = np.stack([(height >= low) & (height <= high) for low, high in ranges]).astype(float)
+    each = [((low, high), (height >= low) & (height <= high)) for low, high in pairwise(model.settings.latitude_edges)]
+    ranges = [ends for ends, band in each if band.any()]
+    bands = np.stack([band for _, band in each if band.any()]).astype(float)
     names = tuple(model.channels[c] for group in groups for c in group)
     alike = Element("contrast", "map", names, ell=(2, top), L=0, frame="galactic", kind="contrast")
     elements = tuple(

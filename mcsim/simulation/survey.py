@@ -443,6 +443,6 @@ def _overlap(x: SurveyMap, y: SurveyMap) -> float:
     overlap = float(np.mean(product))
     if overlap <= 0.0:
         raise InputError(
-            f'Maps {x.name} and {y.name} share no pixel, so they have no cross spectra; set pairs = "auto".'
+            f'Maps {x.name} and {y.name} share no pixel, so they have no cross spectra; set biposh.pairs = "auto".'
         )
     return overlap

@@ -60,6 +60,15 @@ def test_no_element_names_degrees_that_the_filters_do_not_have(analysis) -> None
     assert ends["plane"] == (2, analysis.model.lmax)
 
 
+def test_bands_of_latitude_without_a_pixel_are_no_elements() -> None:
+    """Their contrast of frequencies was 0 in all simulations: "element 154 ... has no finite variance; omit it"."""
+    settings = DiagnosisSettings(latitude_edges=(0.0, 0.03, 0.95, 1.0), large_scales=5)
+    few = analysis_of(config.load(two_channels("bands")), without=tuple(catalogue()), settings=settings)
+    assert [one.component for one in few.elements if one.kind == "contrast"] == ["|sin b| 0.03–0.95", "|sin b| 0.95–1"]
+    vectors = [few.data_vector(list(simulate.maps(survey(few.run), number))) for number in range(3)]
+    assert np.std(vectors, axis=0).min() > 0.0
+
+
 def test_elements_are_of_degrees_that_the_maps_show() -> None:
     """Bins of a beam where a step in harmonics, or the spectrum, has ended were zero in all simulations: a refusal."""
     rotated = {"preparation": [{"kind": "rotate", "frame": "galactic"}]}
