@@ -28,8 +28,9 @@ from mcsim.systematics.added import DipoleResidual
 SMALL = 2e-3  #: gain of a channel that observed skies may have in them: responses are wrong by less than this share
 
 BENT = 0.02
-"""Change of a beam at some degree, beside a gain, that observed skies may have in them: up to that share of a response
-that is simulated there is missing, with the weight that the channel has in the sky, and a fit is as much too large."""
+"""Change of a beam or a pixel's window at some degree, beside a gain, that observed skies may have in them: up to that
+share of a response that is simulated there is missing, with the weight that the channel has in the sky, and a fit is as
+much too large."""
 
 ASKEW = 0.1  #: what orders m > 0 add to a beam that observed skies may have in them: it is no sky, but for its square
 
@@ -247,10 +248,12 @@ class SameSkies:
         It is one number for all degrees where the effects rescale the channel as a whole.
         """
         model, rows = self.analysis.model, []
-        for channel in model.survey.channels if found else ():
-            row = np.full(model.lmax + 1, systematics.rescaling(self._acting(channel, found), channel.site))
+        for channel, made in zip(model.survey.channels, model.survey.making.channels, strict=True) if found else ():
+            acting = self._acting(channel, found)
+            row = np.full(model.lmax + 1, systematics.rescaling(acting, channel.site))
             before, after = (beam.blm[0, : model.lmax + 1].real for beam in self._beams(channel, found))
             shape = np.where(before > 0.0, divided(after, before), 1.0)
+            shape *= made.seen_window[: model.lmax + 1] ** (systematics.spread_of(acting) ** 2 - 1.0)
             rows.append(shape if np.abs(shape / row - 1.0).max() > BENT else row)
         return (
             () if all(np.abs(row - 1.0).max() <= SMALL for row in rows) else tuple(tuple(row.tolist()) for row in rows)
