@@ -270,7 +270,8 @@ class Job:
     @property
     def given(self) -> bytes:
         """Return what tells the skies that data constrain from those of other data; b"" without data."""
-        return b"" if self.observed is None else bytes([self.negative]) + self.observed.tobytes()
+        spread = b"" if self.spread is None else self.spread.tobytes()
+        return b"" if self.observed is None else bytes([self.negative]) + self.observed.tobytes() + spread
 
 
 def data_vectors(job: Job, library: Library | None = None) -> Vector:

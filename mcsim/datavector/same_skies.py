@@ -1,6 +1,5 @@
 """Simulate data vectors of the same skies without effects and with them: in typical skies, or in constrained ones."""
 
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache
@@ -70,13 +69,7 @@ class SameSkies:
     ask: Ask
     maps: Sequence[Map]
     noise: Sequence[config.Effect] = ()  # that all simulations have, but for those with such effects of their own
-    # Data vectors without any effect but noise, as many as were needed so far. Keys are True for constrained skies, for
-    # an external simulator, with noise, and for negative skies, and how the maps were seen that constrain them.
-    _before: dict[tuple[bool, bool, bool, bool, Seen], list[Vector]] = field(
-        default_factory=lambda: defaultdict(list), init=False
-    )
-    # What was simulated ahead, by all that tells such jobs apart.
-    _ahead: dict[tuple[str, int, int, bytes], Matrix] = field(default_factory=dict, init=False)
+    _done: dict[tuple[str, int, int, bytes, bool], Matrix] = field(default_factory=dict, init=False)  # by :func:`_key`
 
     @property
     def observed(self) -> Alm:
@@ -309,7 +302,7 @@ class SameSkies:
         sets = [(found, kind == "constrained", None if kind == "reference" else skies) for found, kind in kinds]
         jobs = [job for one in sets for job in self._jobs(*one, there=one[0])]
         jobs += [replace(job, negative=True) for job in jobs if odd]
-        self._ahead.update(zip(map(_key, jobs), self.ask(jobs) if jobs else [], strict=True))
+        self._simulate(jobs)
 
     def of_reference(self, found: Sequence[config.Effect]) -> Matrix:
         """Return data vectors with effects, of the skies with which responses are measured."""
@@ -325,13 +318,9 @@ class SameSkies:
         noise = without_repeats(self.noise, found)
         there = [*noise, *found]
         jobs = [replace(job, negative=negative) for job in self._jobs(there, constrained, skies, there=there)]
-        source, seen = jobs[0].source, self.seen(there) if constrained else ((), (), (), "", "", ())
-        before = self._before[constrained, source is not None, bool(noise), negative, seen]
-        if (first := len(before)) < skies:
-            same = self._jobs(noise, constrained, skies, first, there)
-            same = [replace(job, source=source, negative=negative) for job in same]
-            before.extend(self._simulated(same)[first - skies :])
-        return np.stack(before[:skies]), self._simulated(jobs)
+        same = self._jobs(noise, constrained, skies, there=there)
+        same = [replace(job, source=jobs[0].source, negative=negative) for job in same]
+        return self._simulated(same), self._simulated(jobs)
 
     def odd(self, found: Sequence[config.Effect], skies: int) -> Matrix:
         """Return what changes of data vectors by effects have of the sign of constrained skies, shape (skies, p + E).
@@ -346,23 +335,26 @@ class SameSkies:
         found: Sequence[config.Effect],
         constrained: bool,
         skies: int | None,
-        first: int = 0,
         there: Sequence[config.Effect] = (),
     ) -> list[Job]:
-        """List the jobs that simulate effects; of skies that are not constrained, always from the first one on."""
+        """List the jobs that simulate effects."""
         if not constrained or skies is None:
             jobs = after_jobs(self.analysis, found, skies)
         else:
             observed, spread = self.observed_with(there), self.spread(self.factors(there), self.noise_of(there))
-            jobs = constrained_jobs(self.analysis, found, observed, range(first, skies), spread)
+            jobs = constrained_jobs(self.analysis, found, observed, range(skies), spread)
         source = self.analysis.source_of(found, given_sky=constrained)
         return [replace(job, slices=True, source=source) for job in jobs]
 
     def _simulated(self, jobs: Sequence[Job]) -> Matrix:
-        known = {_key(job): self._ahead.pop(_key(job), None) for job in jobs}
-        missing = [job for job in jobs if known[_key(job)] is None]
-        known.update(zip(map(_key, missing), self.ask(missing) if missing else [], strict=True))
-        return np.concatenate([rows for rows in known.values() if rows is not None])
+        self._simulate(jobs)
+        return np.concatenate([self._done[_key(job)] for job in jobs])
+
+    def _simulate(self, jobs: Sequence[Job]) -> None:
+        """Simulate what has not been simulated for these data."""
+        missing = {_key(job): job for job in jobs if _key(job) not in self._done}
+        if missing:
+            self._done.update(zip(missing, self.ask(list(missing.values())), strict=True))
 
 
 def _divided(maps: Sequence[Map], gains: Sequence[float]) -> list[Map]:
@@ -382,5 +374,6 @@ def makes_means(effect: systematics.Effect, site: systematics.Site) -> bool:
     return bool(np.any((with_sky - alone)[ell <= 1]))
 
 
-def _key(job: Job) -> tuple[str, int, int, bytes]:
-    return job.simulated, job.first, job.count, job.given
+def _key(job: Job) -> tuple[str, int, int, bytes, bool]:
+    """Return all that tells jobs for the same data apart."""
+    return job.simulated, job.first, job.count, job.given, job.source is None

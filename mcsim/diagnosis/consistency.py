@@ -13,8 +13,9 @@ from mcsim.datavector.slices import northern
 from mcsim.datavector.summaries import Element, bins, scales
 from mcsim.sphere.rotation import FRAMES
 from mcsim.stats.excess import scatter_chi2
-from mcsim.stats.gaussian import SimulatedGaussian, Tolerated
-from mcsim.support.arrays import Matrix, Rows, Vector
+from mcsim.stats.gaussian import Fit, SimulatedGaussian, Tolerated
+from mcsim.stats.scattered import with_scatter
+from mcsim.support.arrays import Matrix, Rows, Vector, divided
 from mcsim.support.numbers import number, p_equals
 from mcsim.systematics import Effect, acts_through
 
@@ -252,20 +253,31 @@ class Slices:
         parts = [one @ response[rows] for one in division.keep]
         whole = null.fit(x, np.column_stack([beside, response[rows]]))
         apart = null.fit(x, np.column_stack([beside, *parts]))
-        amplitudes, errors = apart.amplitudes[count:], action.wider * apart.errors[count:]
+        wider = self._wider(null, np.column_stack([beside, *parts]), apart, action, rows, slice(count, None))
+        amplitudes, errors = apart.amplitudes[count:], wider * apart.errors[count:]
         fitted, further = null.dimension - whole.dimension, whole.dimension - apart.dimension
         if further < 1 or np.any(errors == 0.0):
             return None
         allowance = self._tolerated(null, whole.amplitudes[-1] * response[rows])
-        more, chi2 = max(whole.chi2 - apart.chi2, 0.0) / action.wider**2, whole.chi2 / action.growth**2
+        more, chi2 = max(whole.chi2 - apart.chi2, 0.0) / wider**2, whole.chi2 / action.growth**2
         p = float(null.nested_test(more, chi2, further, fitted, Tolerated(allowance)))
         best = int(np.argmax(amplitudes / errors))
         found = null.fit(x, np.column_stack([beside, parts[best], sum(parts) - parts[best]]))
-        variance = (action.wider * found.errors[-1]) ** 2 + action.error**2 + self.settings.consistency_error**2
+        variance = (wider * found.errors[-1]) ** 2 + action.error**2 + self.settings.consistency_error**2
         odds = float(np.exp(min((0.5 - found.amplitudes[-1]) / variance, 100.0)))
         return Comparison(
             division.kind, division.words, tuple(map(float, amplitudes)), tuple(map(float, errors)), p, odds
         )
+
+    def _wider(self, null: SimulatedGaussian, t: Matrix, fit: Fit, action: Action, rows: Rows, own: slice) -> float:
+        """Return by how much errors of amplitudes grow with the effect in the data, at least as they do in all data.
+
+        They are the ``own`` of a fit of templates, (rows, K): a part may be made of what the effect scatters most.
+        """
+        if action.pair is None:
+            return action.wider
+        grown = with_scatter(null, t, fit, *(each[:, rows] for each in action.pair))
+        return max(action.wider, float(np.max(divided(grown.errors, fit.errors, 1.0)[own])))
 
     def _clear(self, division: Division, response: Vector, known: bool) -> Division:
         """Return a division without parts in which a response does not show; neighbours that do together are one."""
@@ -312,8 +324,10 @@ class Slices:
                 seen.append((name, rows, null))
         whole = self._amplitudes(np.arange(len(self.z) - self.beside), action) if seen else None
         for name, rows, null in seen:
-            found = null.fit(self.z[rows], np.column_stack([response[rows], action.directions[rows]]))
-            amplitude, own = float(found.amplitudes[0]), action.wider * float(found.errors[0])
+            t = np.column_stack([response[rows], action.directions[rows]])
+            found = null.fit(self.z[rows], t)
+            wider = self._wider(null, t, found, action, rows, slice(1))
+            amplitude, own = float(found.amplitudes[0]), wider * float(found.errors[0])
             each = self._amplitudes(rows, action)
             alike = 0.0 if whole is None or each is None else float(np.corrcoef(each, whole)[0, 1])
             apart = own**2 + action.error**2 - 2.0 * alike * own * action.error

@@ -190,8 +190,11 @@ class DataSet(ABC, Generic[Data]):
         share = (1.0 / self.realizations + 1.0 / len(changes)) / (len(changes) - 1.0)
         return np.asarray(np.sqrt(share) * (changes - changes.mean(axis=0)).T)
 
-    def pair(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix] | None:
-        """Return data vectors of the same skies without effects and with them; None if errors do not need them."""
+    def pair(self, found: Sequence[config.Effect], skies: int | None = None) -> tuple[Matrix, Matrix] | None:
+        """Return data vectors of the same skies without effects and with them; None if errors do not need them.
+
+        ``skies``: their number, where it can be chosen; None: that of the settings.
+        """
         return None
 
     def in_same_skies(self, found: Sequence[config.Effect]) -> list[list[config.Effect]]:

@@ -25,7 +25,7 @@ from mcsim.diagnosis.words import refuted
 from mcsim.errors import InputError
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit
-from mcsim.stats.scattered import with_drawn_scatter, with_scatter, with_tangents
+from mcsim.stats.scattered import GROWS, with_drawn_scatter, with_scatter, with_tangents
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.support.numbers import measured
 from mcsim.systematics import acts_through, if_possible
@@ -184,9 +184,13 @@ def _scattered(data: DataSet, candidates: Sequence[Candidate], members: Sequence
     with if_possible():  # between what was fitted and what can be
         acting = tables_at(context.candidates, members, first)
         groups, unknown = data.in_same_skies(acting), [one for one in acting if not context.knows(one)]
-        pairs = _pairs(data, groups)
-        for pair in pairs if unknown == acting else _pairs(data, data.in_same_skies(unknown)):
-            fit = with_scatter(context.null, t, fit, *pair)
+        pairs, scatter = _pairs(data, groups), data.in_same_skies(unknown)
+        for skies in (context.settings.constrained_skies, context.settings.noisy_skies):
+            fit = first
+            for pair in _pairs(data, scatter, skies):
+                fit = with_scatter(context.null, t, fit, *pair)
+            if np.all(fit.errors**2 <= (1.0 + GROWS) * first.errors**2):
+                break
         bend = context.null.whiten_templates(t - context.templates[:, columns_of(context.candidates, members)])
         tables = tables_beside(context.candidates, members, first, bend, context.settings.nonlinear_sigma)
         return with_tangents(context.null, t, fit, [_slope(data, groups, pairs, *one) for one in tables])
@@ -208,8 +212,10 @@ def _alone(data: DataSet, members: Sequence[int], drawn: int, first: Fit) -> Mat
     return data.scatter(before[:, : len(data.x)])
 
 
-def _pairs(data: DataSet, groups: Sequence[Sequence[config.Effect]]) -> list[tuple[Matrix, Matrix]]:
-    return [pair for own in groups if (pair := data.pair(own)) is not None]
+def _pairs(
+    data: DataSet, groups: Sequence[Sequence[config.Effect]], skies: int | None = None
+) -> list[tuple[Matrix, Matrix]]:
+    return [pair for own in groups if (pair := data.pair(own, skies)) is not None]
 
 
 def _slope(

@@ -11,6 +11,7 @@ from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import is_drawn
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import Attribution, Explanation
+from mcsim.stats.scattered import GROWS
 from mcsim.support.arrays import Matrix
 from mcsim.systematics import if_possible
 
@@ -113,7 +114,10 @@ def _actions(data: DataSet, refined: Refined, one: Explanation) -> Iterator[Acti
         candidate = context.candidates[member]
         t = whole[:, list(candidate.columns)]
         draws, scatter = refined.candidates[member].scatter is not None or candidate.parametrization.nonlinear, None
-        skies, growth = context.settings.scatter_skies if draws else context.settings.constrained_skies, 1.0
+        acting, growth = None if draws else refined.candidates[member].acting, 1.0
+        skies = context.settings.scatter_skies if draws else context.settings.constrained_skies
+        if acting is not None and acting.own > GROWS:
+            skies = max(skies, context.settings.noisy_skies)
         pair: tuple[Matrix, Matrix] | None = None
         response = t @ theta
         with if_possible():
@@ -127,7 +131,6 @@ def _actions(data: DataSet, refined: Refined, one: Explanation) -> Iterator[Acti
             response, scatter = changes.mean(axis=0), data.scatter(changes) if draws else None
             if not (draws or known):  # else its scatter is in the covariance
                 pair = simulated
-        acting = None if draws else refined.candidates[member].acting
         variance = 1.0 if acting is None else 1.0 + max(acting.own, 0.0)
         action = Action.of(response, t, theta, variance * covariance, scatter)
         yield replace(action, growth=growth, wider=max(growth, float(np.sqrt(variance))), pair=pair)

@@ -91,14 +91,14 @@ class ObservedMaps(DataSet[Sequence[Map]]):
             self.same_skies.ahead([one.table(effect) for one in candidates for effect in one.basis], skies)
         yield from super().responses(candidates, skies)
 
-    def pair(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix]:
+    def pair(self, found: Sequence[config.Effect], skies: int | None = None) -> tuple[Matrix, Matrix]:
         """Return data vectors of the same skies without effects and with them; for noise alone of all of reference."""
-        size, skies, library = len(self.x), self.context.settings.constrained_skies, dict(self.context.analysis.library)
+        size, library = len(self.x), dict(self.context.analysis.library)
         noise = all(library[effect.name].parametrization.noise_alone for effect in found)
         if noise or any(self.same_skies.skies_of(effect) == "reference" for effect in found):
             before, after = self.of_reference(found)
         else:
-            before, after = self.same_skies.pair(found, skies, True)
+            before, after = self.same_skies.pair(found, skies or self.context.settings.constrained_skies, True)
         return before[:, :size], after[:, :size]
 
     def in_same_skies(self, found: Sequence[config.Effect]) -> list[list[config.Effect]]:

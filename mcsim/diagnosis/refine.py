@@ -14,7 +14,7 @@ from mcsim.diagnosis.selection import Attribution, Explanation, Selection, attri
 from mcsim.errors import InputError
 from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit
-from mcsim.stats.scattered import Acting
+from mcsim.stats.scattered import GROWS, Acting
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import if_possible
 
@@ -287,6 +287,8 @@ class Refiner:
             now.candidates[index] = replace(candidate, scatter=self.data.scatter(changes), shape_error=None)
         elif pair is not None and not self.context.knows(there):
             acting = Acting.of(self.context.null, now.t, [one.columns for one in now.candidates], index, pair)
+            if acting.own > GROWS and (more := self.data.pair([there], self.context.settings.noisy_skies)) is not None:
+                acting = Acting.of(self.context.null, now.t, [one.columns for one in now.candidates], index, more)
             if acting.own <= WIDE or how.noise_alone:
                 now.candidates[index] = replace(candidate, acting=acting, scatter=None)
             elif candidate.scatter is None or done is None or np.linalg.norm(at - done) > MOVED * np.linalg.norm(at):

@@ -12,6 +12,10 @@ from mcsim.support.arrays import Matrix, Rows, Vector, divided
 
 STEEPEST = 1e3  #: condition number above which derivatives tell no errors
 
+GROWS = 0.5
+"""Variance that effects add along their own responses, over that without them, from which on more skies tell it: a few
+that are the same for all data can be wrong by a factor."""
+
 Groups = Sequence[Sequence[int]]  #: columns of the templates of each candidate
 
 

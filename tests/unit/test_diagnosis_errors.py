@@ -89,20 +89,22 @@ def test_each_effect_of_a_set_scatters_the_skies_in_which_its_response_is_measur
     candidates = [Candidate(kind, None, (k,)) for k, kind in enumerate(library.values())]
     analysis: Any = SimpleNamespace(library=library, model=SimpleNamespace(channels=("W1", "W2")))
     same = SameSkies(analysis, lambda _: [], ())
-    asked: list[tuple[str, ...]] = []
+    asked: list[tuple[str, int | None]] = []
 
-    def pair(found: list[config.Effect]) -> tuple[Matrix, Matrix]:
-        asked.append(tuple(one.name for one in found))
+    def pair(found: list[config.Effect], number: int | None) -> tuple[Matrix, Matrix]:
+        asked.append((" ".join(one.name for one in found), number))
         before = rng.normal(size=(skies, size))
         typical = 5.0 * rng.normal(size=(skies, size)) * (len(found) > 1)
         return before, (1.5 if found[0].name == "spectrum" else 1.0) * before + 20.0 * t[:, 0] + typical
 
     data: Any = SimpleNamespace(same_skies=same, pair=pair)
     data.in_same_skies = lambda found: ObservedMaps.in_same_skies(data, found)
-    known = {"null": null, "templates": t, "settings": SimpleNamespace(nonlinear_sigma=0.5)}
+    settings = SimpleNamespace(nonlinear_sigma=0.5, constrained_skies=8, noisy_skies=24)
+    known = {"null": null, "templates": t, "settings": settings}
     data.context = SimpleNamespace(candidates=candidates, knows=lambda table: False, **known)
     fit = null.fit(t @ [0.2, 0.1], t)
     found = _scattered(data, candidates, [0, 1], t, fit)
-    assert sorted(asked) == [("calibration",), ("spectrum",)]
+    # With the variance more than half as large again, more skies tell it.
+    assert asked == [(name, number) for number in (None, 8, 24) for name in ("calibration", "spectrum")]
     # Noise that is 1.5 times as strong, and an eighth of what more is in the mean over as many skies.
     np.testing.assert_allclose(found.errors / fit.errors, np.sqrt(1.5**2 + 0.5**2 / skies), rtol=1e-9)

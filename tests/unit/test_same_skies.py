@@ -22,9 +22,9 @@ from mcsim.simulation.survey import survey
 def test_effects_are_asked_for_at_once_and_then_known(monkeypatch: pytest.MonkeyPatch) -> None:
     """Then only skies without effects are simulated, once for both effects."""
 
-    def jobs(own: Any, found: Any, constrained: bool, skies: int, first: int = 0, there: Any = ()) -> list[Any]:
+    def jobs(own: Any, found: Any, constrained: bool, skies: int, there: Any = ()) -> list[Any]:
         name = "".join(effect.name for effect in found)
-        return [SimpleNamespace(simulated=name, first=first, count=skies - first, given=b"", source=None)]
+        return [SimpleNamespace(simulated=name, first=0, count=skies, given=b"", source=None)]
 
     def ask(wanted: Any) -> list[np.ndarray]:
         asked.append([job.simulated for job in wanted])
@@ -43,8 +43,10 @@ def test_effects_are_asked_for_at_once_and_then_known(monkeypatch: pytest.Monkey
     for size, (before, after) in enumerate(pairs, 1):
         np.testing.assert_array_equal(before, np.zeros((3, 2)))
         np.testing.assert_array_equal(after, np.full((3, 2), size))
-    skies.pair(effects[:1], 3, True)  # what was simulated ahead serves once
-    assert asked[2:] == [["a"]]
+    skies.pair(effects[:1], 3, True)
+    assert len(asked) == 2
+    skies.pair(effects[:1], 5, True)
+    assert asked[2:] == [[""], ["a"]]
 
 
 def test_the_sky_of_maps_with_a_gain_is_found_without_it() -> None:
