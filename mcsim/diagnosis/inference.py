@@ -161,13 +161,14 @@ def confirmed(
 
 
 def _with_errors(data: DataSet, refined: Refined, found: Attribution) -> Attribution:
-    """Return the attribution, sets with priors of nuisances in errors, the best also with its effects in the data."""
+    """Return the attribution, sets with priors of nuisances in errors, those that are compared also with effects."""
     context, sets = data.context, list[Explanation]()
     for one in found.explanations:
         members = [refined.candidates[member] for member in one.members]
         t = refined.templates[:, columns_of(context.candidates, one.members)]
         null = context.null.with_extra_covariance(*scatters_of(refined.candidates, one.members))
-        scattered = [] if sets else [partial(_scattered, data, refined.candidates, one.members, t)]
+        acting = len(sets) < context.settings.compared_sets
+        scattered = [partial(_scattered, data, refined.candidates, one.members, t)] if acting else []
         sets.append(replace(one, fit=with_priors(null, t, one.fit, members, *scattered)))
     return replace(found, explanations=tuple(sets))
 

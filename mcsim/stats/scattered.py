@@ -10,7 +10,8 @@ from mcsim.stats.few_draws import scores_of_draws, without
 from mcsim.stats.gaussian import COLLINEAR, Fit, SimulatedGaussian, Tolerated, orthonormal
 from mcsim.support.arrays import Matrix, Rows, Vector, divided
 
-STEEPEST = 1e3  #: condition number above which derivatives tell no errors
+FLAT = 0.5  #: derivative of a response over its secant, below which a parabola tells errors
+FLATTEST = 1e-9  #: derivative of a response over its secant, below which it is none
 
 GROWS = 0.5
 """Variance that effects add along their own responses, over that without them, from which on more skies tell it: a few
@@ -165,8 +166,8 @@ def with_tangents(null: SimulatedGaussian, t: Matrix, found: Fit, tangents: Sequ
     T'C^-1 (x - R(theta)) = 0, and the data move it by the inverse of G = (T'C^-1 T)^-1 T'C^-1 dR/dtheta, which is one
     for straight responses. The covariance V of the lines becomes G^-1 V G'^-1. Each element of G - 1 is measured in
     few skies, d +- s, and of a normal prior of mean zero whose variance is estimated as d^2 - s^2 >= 0: its posterior
-    mean is d (1 - s^2/d^2) (empirical Bayes; Efron & Morris, JASA 68, 117, 1973). Pulls:
-    tests/unit/test_diagnosis_scattered.py.
+    mean is d (1 - s^2/d^2) (empirical Bayes; Efron & Morris, JASA 68, 117, 1973). Near a peak of the response errors
+    are those of its parabola (:func:`_on_parabola`). Pulls: tests/unit/test_diagnosis_scattered.py.
     """
     basis, back = orthonormal(null.whiten_templates(t))
     slopes = np.eye(len(back))
@@ -176,10 +177,27 @@ def with_tangents(null: SimulatedGaussian, t: Matrix, found: Fit, tangents: Sequ
             d = each.mean(axis=1)
             s = each.std(axis=1, ddof=1) / np.sqrt(len(rows)) if len(rows) > 1 else np.zeros(len(d))
             slopes[:, k] += d * np.maximum(1.0 - divided(s**2, d**2), 0.0)
-    if np.linalg.cond(slopes) > STEEPEST:
-        return found
-    move = np.linalg.inv(slopes)
-    return replace(found, covariance=move @ found.covariance @ move.T)
+    left, sizes, right = np.linalg.svd(slopes)
+    move = right.T @ (left / np.maximum(sizes, FLATTEST)).T
+    covariance = move @ found.covariance @ move.T
+    errors = np.sqrt(np.diag(covariance))
+    share = divided(_on_parabola(found.errors, errors, np.abs(found.amplitudes)), errors, 1.0)
+    return replace(found, covariance=share[:, None] * covariance * share)
+
+
+def _on_parabola(line: Vector, tangent: Vector, amplitude: Vector) -> Vector:
+    """Return errors of amplitudes from those by their lines and tangents: of a parabola where tangents are flat.
+
+    Notes
+    -----
+    With g the tangent over the line, the parabola through zero and the fit changes by g d + (1 - g) d^2/a, in units of
+    the line, towards zero: that is the error of the line at the d returned, which is not taken to be less. At a peak a
+    tangent tells no error.
+    """
+    g = divided(line, tangent, 1.0)
+    bend = divided(1.0 - g, amplitude)
+    d = divided(np.sqrt(g**2 + 4.0 * np.maximum(bend, 0.0) * line) - g, 2.0 * bend)
+    return np.where(g < FLAT, np.maximum(d, line), tangent)
 
 
 def with_drawn_scatter(
