@@ -3,7 +3,9 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,8 @@ from mcsim.support.folders import replacing, unwritable
 from mcsim.support.numbers import number
 
 TABLE, STORE, PICTURE = "limit.json", "limit.zarr", "limit.png"
+
+COLUMNS = (24, 12, 12, 12, 12, 24, 5, 12)  #: letters after which a cell of the table goes on in the next line
 
 RESOLVED = 1e-10  #: directions of an effect with less than this share of its largest information are unconstrained
 
@@ -147,7 +151,7 @@ class Limits:
         return " ".join(said)
 
     def lines(self) -> list[str]:
-        """Return the table as text."""
+        """Return the table as text, long cells on more than one line."""
         rows: list[tuple[str, ...]] = []
         rows.append(("effect", "unit", "sigma", "detected alone", "detected", "most similar", "|rho|", "told apart"))
         for one in self.effects:
@@ -156,9 +160,11 @@ class Limits:
                 similar = (self.effects[one.similar].label, f"{one.correlation:.2f}", one.amplitude("separable"))
             detected = (one.amplitude(key) for key in ("amplitude_90_known", "amplitude_90"))
             rows.append((one.label, one.unit, number(one.sigma), *detected, *similar))
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        cells = [[wrap(*one, break_long_words=False) for one in zip(row, COLUMNS, strict=True)] for row in rows]
+        folded = [line for row in cells for line in zip_longest(*row, fillvalue="")]
+        widths = [max(map(len, column)) for column in zip(*folded, strict=True)]
         side = ["<", "<", ">", ">", ">", "<", ">", ">"]
-        table = ["  ".join(f"{cell:{side[i]}{widths[i]}}" for i, cell in enumerate(row)) for row in rows]
+        table = ["  ".join(f"{cell:{side[i]}{widths[i]}}" for i, cell in enumerate(row)) for row in folded]
         worst = max((one.error for one in self.effects), default=0.0)
         error = f" Errors of sigma from random probes: at most {100 * worst:.2g} %." if worst else ""
         marked = "*: more than the effect can have (mcsim effects says what is possible)." if self.impossible else ""

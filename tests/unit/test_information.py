@@ -412,6 +412,9 @@ def test_limits_are_written_and_say_what_they_are(tmp_path) -> None:
     odd = tuple(replace(one, title="a$_$b", unit="c$_$d") for one in found.effects)  # what matplotlib cannot parse
     limit_figure(replace(found, effects=odd)).draw_without_rendering()
     assert any(line.startswith("noise_level (V1)") for line in found.lines())
+    long = replace(found, effects=tuple(replace(one, label=8 * "letters ") for one in found.effects))
+    assert max(map(len, long.lines()[: 3 * len(found.effects)])) <= 120
+    assert sum(line.count("letters") for line in long.lines()) == 16 * len(found.effects)
     unknown = replace(found, settings=replace(found.settings, nuisances={"beam_width": 0.01}, unknown_dipole_uk=10.0))
     assert unknown.lines()[-1] == "Marginalised over beam_width ± 0.01, a monopole and dipole of 10 µK rms."
     assert unknown.to_dataset().attrs["unknowns"] == unknown.lines()[-1]
