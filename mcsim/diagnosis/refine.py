@@ -286,9 +286,11 @@ class Refiner:
         if stochastic:
             now.candidates[index] = replace(candidate, scatter=self.data.scatter(changes), shape_error=None)
         elif pair is not None and not self.context.knows(there):
-            acting = Acting.of(self.context.null, now.t, [one.columns for one in now.candidates], index, pair)
-            if acting.own > GROWS and (more := self.data.pair([there], self.context.settings.noisy_skies)) is not None:
-                acting = Acting.of(self.context.null, now.t, [one.columns for one in now.candidates], index, more)
+            groups = [one.columns for one in now.candidates]
+            acting = Acting.of(self.context.null, now.t, groups, index, pair)
+            if acting.own > GROWS:
+                pair = self.data.pair([there], self.context.settings.noisy_skies) or pair
+                acting = Acting.of(self.context.null, now.t, groups, index, pair)
             if acting.own <= WIDE or how.noise_alone:
                 now.candidates[index] = replace(candidate, acting=acting, scatter=None)
             elif candidate.scatter is None or done is None or np.linalg.norm(at - done) > MOVED * np.linalg.norm(at):
