@@ -135,10 +135,10 @@ def diagnose(
             found: DataSet = ObservedMaps(known, maps, ask) if table is None else MeasuredSpectra(known, table, ask)
             if source is not None:
                 campaign.check_data(found.x, ensemble, source)
-            found, diagnosis = diagnosed(found, str(case or run.name))
-        if diagnosis.kind == "unknown" and isinstance(found, ObservedMaps) and source is None and not diagnosis.orders:
+            left, diagnosis = diagnosed(found, str(case or run.name))
+        if diagnosis.kind == "unknown" and isinstance(left, ObservedMaps) and source is None and not diagnosis.orders:
             with asking(call, quiet, simulated_scores.scores, "simulations of what is not listed") as ask:
-                diagnosis = unlisted.reconstructed(diagnosis, found, ask)
+                diagnosis = unlisted.reconstructed(diagnosis, left, ask)
     if means:
         diagnosis = replace(diagnosis, notes=(words.PIXEL_MEANS, *diagnosis.notes))
     if source is not None:

@@ -19,8 +19,8 @@ def diagnose_data(data: DataSet, case: str) -> DiagnosisResult:
     return diagnosed(data, case)[1]
 
 
-def diagnosed(data: DataSet, case: str) -> tuple[DataSet, DiagnosisResult]:
-    """Diagnose as :func:`diagnose_data` does; return also the data of which the result is.
+def diagnosed(data: DataSet, case: str) -> tuple[DataSet | None, DiagnosisResult]:
+    """Diagnose as :func:`diagnose_data` does; return also the data of which it is, None if bad pixels are all.
 
     Pixels that stand out of residual maps are left out, unless an effect makes them, and so are those that do beside
     the effects which fit the rest. If the rest departs from the model, the result is of the rest.
@@ -33,10 +33,10 @@ def diagnosed(data: DataSet, case: str) -> tuple[DataSet, DiagnosisResult]:
         return data, left.result(case)
     if rest is data:
         remedy = f"{LOOK_SO}: nothing is named before these pixels are left out; give the model a mask (map.mask)."
-        return data, left.result(case, *bad.sentences, remedy)
+        return None, left.result(case, *bad.sentences, remedy)
     if left.refined.attribution.verdict == "none":
         fits = f"{LOOK_SO}. Without these pixels the model fits (p = {rest.gap.pvalue:.2g})."
-        return data, _unexplained(data).result(case, *bad.sentences, fits)
+        return None, _unexplained(data).result(case, *bad.sentences, fits)
     departs = f"{LOOK_SO}: they are left out of all that follows. With them the maps have p = {data.gap.pvalue:.2g}."
     return rest, left.result(case, *bad.sentences, departs)
 

@@ -69,8 +69,8 @@ def test_bad_pixels_of_one_map_are_named_nothing(small, shared):
     bad = rng.choice(3072, 4, replace=False)
     changed = [map_uk.copy() for map_uk in simulate.maps(shared, 2)]
     changed[2][bad] += np.array([-20.0, 18.0, 16.0, -15.0]) * shared.maps[2].noise_uk[bad]
-    found = diagnose_data(ObservedMaps(small, changed, ask), "glitches")
-    assert (found.kind, found.sets) == ("unknown", ())
+    left, found = verdict.diagnosed(ObservedMaps(small, changed, ask), "glitches")
+    assert (left, found.kind, found.sets) == (None, "unknown", ())
     first, rest = found.verdict["notes"]
     assert f"4 places of the residual of {shared.map_names[2]} stand out, up to" in first
     for lon, lat in zip(*healpy.pix2ang(16, bad, lonlat=True), strict=True):
@@ -170,7 +170,8 @@ def test_what_bad_pixels_hide_is_named_without_them(small):
     bad = [300, 1000, 1700, 2400]
     maps[0][bad] += np.array([60.0, -80.0, 40.0, 100.0]) * found.maps[0].noise_uk[bad]
     data = ObservedMaps(small, maps, ask)
-    told = diagnose_data(data, "both")
+    left, told = verdict.diagnosed(data, "both")
+    assert [int(np.sum(one == healpy.UNSEEN)) for one in left.data] == [4, 0, 0, 0]
     assert [(one.name, one.channel) for one in told.effects] == [("beam_ellipticity", "W1")]
     assert abs(told.effects[0].amplitude - given.effects[0].amplitude) < 0.5 * told.effects[0].sigma
     assert told.notes[0].startswith(f"4 places of the residual of {found.map_names[0]} stand out")
