@@ -236,6 +236,10 @@ class DataSet(ABC, Generic[Data]):
         """Return the data without bad pixels; None if these are more than may be left out."""
         return self
 
+    def notes(self) -> list[str]:
+        """Return sentences on the data."""
+        return []
+
     def residual_maps(self) -> Matrix | None:
         """Return the residual maps over the scatter of those of simulations, shape (map, npix); None without maps."""
         return None

@@ -62,8 +62,8 @@ class Inferred:
         return []
 
     def result(self, case: str, *notes: str) -> DiagnosisResult:
-        """Return the result of a case, with notes before its own."""
-        said = (*notes, *self.notes)
+        """Return the result of a case, with notes before its own and those on the data."""
+        said = (*notes, *self.data.notes(), *self.notes)
         return replace(result_of(self.data, case, self.refined, self.reduction, said), orders=self.orders)
 
 

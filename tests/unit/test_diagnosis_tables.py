@@ -21,7 +21,7 @@ from mcsim.diagnosis import api, report
 from mcsim.diagnosis.context import context
 from mcsim.diagnosis.measured_spectra import MeasuredSpectra
 from mcsim.diagnosis.naming import slices_of
-from mcsim.diagnosis.verdict import diagnose_data
+from mcsim.diagnosis.verdict import _unrefined, diagnose_data
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.sphere.rotation import rotate_biposh
@@ -307,6 +307,7 @@ def test_errors_that_the_model_does_not_have_are_noted(small, tmp_path):
     for factor, noted in ((1.0, 0), (3.0, 1), (np.nan, 0), (np.where(first, np.nan, 3.0), 1)):
         found = MeasuredSpectra(small, replace(spectra, error=factor * spread), lambda jobs: [])
         assert len(found.notes()) == noted
+        assert sum("table's errors" in note for note in _unrefined(found).result("errors").notes) == noted
 
 
 def test_halves_of_a_table_are_bins_whatever_the_splits_of_the_maps(small, tmp_path):
