@@ -1,5 +1,6 @@
 """Simulate data vectors of the same skies without effects and with them: in typical skies, or in constrained ones."""
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache
@@ -375,5 +376,6 @@ def makes_means(effect: systematics.Effect, site: systematics.Site) -> bool:
 
 
 def _key(job: Job) -> tuple[str, int, int, bytes, bool]:
-    """Return all that tells jobs for the same data apart."""
-    return job.simulated, job.first, job.count, job.given, job.source is None
+    """Return all that tells jobs for the same data apart; of the skies a hash, since they are large and many."""
+    given = hashlib.blake2b(job.given, digest_size=16).digest()
+    return job.simulated, job.first, job.count, given, job.source is None

@@ -12,7 +12,7 @@ from instruments import two_channels
 from mcsim import config, systematics
 from mcsim.datavector.analysis import analysis_of, data_vectors
 from mcsim.datavector.campaign import with_effects
-from mcsim.datavector.same_skies import SameSkies
+from mcsim.datavector.same_skies import SameSkies, _key
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.simulation import simulate
@@ -33,7 +33,6 @@ def test_effects_are_asked_for_at_once_and_then_known(monkeypatch: pytest.Monkey
     asked: list[list[str]] = []
     monkeypatch.setattr(SameSkies, "_jobs", jobs)
     monkeypatch.setattr(SameSkies, "skies_of", lambda *_: "constrained")
-    monkeypatch.setattr(SameSkies, "seen", lambda *_: ((), (), (), "", "", ()))
     monkeypatch.setattr("mcsim.datavector.same_skies.replace", lambda job, **_: job)
     skies = SameSkies(None, ask, ())  # type: ignore[arg-type]
     effects = [config.Effect(name=name) for name in ("a", "bb")]
@@ -47,6 +46,24 @@ def test_effects_are_asked_for_at_once_and_then_known(monkeypatch: pytest.Monkey
     assert len(asked) == 2
     skies.pair(effects[:1], 5, True)
     assert asked[2:] == [[""], ["a"]]
+
+
+def test_keys_tell_all_skies_apart_and_hold_none_of_them() -> None:
+    """At nside 512 every one of hundreds of keys held 8 MB of a sky."""
+    run = config.load(two_channels("keys"))
+    analysis = analysis_of(run, without=tuple(name for name in systematics.catalogue() if name != "beam_width"))
+    sky, spread = np.ones(10_000, dtype=np.complex128), np.ones(41)
+    job = replace(analysis.job(run), count=4)
+    given = [replace(job, observed=one) for one in (sky, 2.0 * sky)]
+    given += [
+        replace(given[0], negative=True),
+        replace(given[0], spread=spread),
+        replace(given[0], spread=2.0 * spread),
+    ]
+    keys = {_key(one) for one in (job, replace(job, first=4), replace(job, count=3), *given)}
+    assert len(keys) == 3 + len(given)
+    assert {len(skies) for _, _, _, skies, _ in keys} == {16}
+    assert _key(given[0]) == _key(replace(job, observed=sky.copy()))
 
 
 def test_the_sky_of_maps_with_a_gain_is_found_without_it() -> None:
