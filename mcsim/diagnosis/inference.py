@@ -186,7 +186,8 @@ def _scattered(data: DataSet, candidates: Sequence[Candidate], members: Sequence
         acting = tables_at(context.candidates, members, first)
         groups, unknown = data.in_same_skies(acting), [one for one in acting if not context.knows(one)]
         pairs, scatter = _pairs(data, groups), data.in_same_skies(unknown)
-        for skies in (context.settings.constrained_skies, context.settings.noisy_skies):
+        few, more = context.settings.constrained_skies, context.settings.noisy_skies
+        for skies in (few, max(few, more)):
             fit = first
             for pair in _pairs(data, scatter, skies):
                 fit = with_scatter(context.null, t, fit, *pair)
