@@ -103,7 +103,8 @@ def standing_out(model: Model, ensemble: NullEnsemble, coarse: Map) -> tuple[dic
     maps = residual_maps(ensemble, coarse)
     if ensemble.nuisances is not None:
         precision = np.stack([part.precision for part in model.parts])
-        weight = healpy.ud_grade(precision, healpy.npix2nside(coarse.shape[1])).reshape(coarse.shape)  # residuals'
+        # Coarse residuals are sums over fine pixels, and so is their weight.
+        weight = healpy.ud_grade(precision, healpy.npix2nside(coarse.shape[1]), power=-2).reshape(coarse.shape)
         maps = (coarse - ensemble.residual_mean) * divided(1.0, np.sqrt(weight), np.nan)
     return outstanding(maps, len(ensemble.bipolar_scan), STANDS_OUT), maps
 

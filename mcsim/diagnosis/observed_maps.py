@@ -219,9 +219,10 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return np.where(share > 0.0, maps, np.nan)
 
     def bad_pixels(self, found: Sequence[config.Effect]) -> BadPixels | None:
-        """Return places of the maps that stand out beside what effects add to them."""
-        model, ensemble = self.context.analysis.model, self.context.ensemble
-        less = self.same_skies.less_added(found)
+        """Return places of the maps that stand out beside what effects add to them: nothing if they cannot act."""
+        model, ensemble, less = self.context.analysis.model, self.context.ensemble, list(self.data)
+        with if_possible():
+            less = self.same_skies.less_added(found)
         as_they_are = all(one is other for one, other in zip(less, self.data, strict=True))
         if as_they_are and not standing_out(model, ensemble, self._measured[2])[0]:
             return None

@@ -44,22 +44,26 @@ def diagnosed(data: DataSet, case: str) -> tuple[DataSet | None, DiagnosisResult
 def _without(data: DataSet, bad: BadPixels | None) -> tuple[BadPixels | None, DataSet, Inferred]:
     """Return bad pixels with all that stand out beside the effects of the rest, the rest, and what it says.
 
-    If more are bad than may be left out the rest is all data, and nothing is said of it.
+    If more are bad than may be left out the rest is all data, and nothing is said of it. Beside a model that fits the
+    rest nothing hides more of them.
     """
     if (rest := data.without(bad) if bad else data) is None:
         return bad, data, _unexplained(data)
     left = inferred(rest)
+    if left.refined.attribution.verdict == "none":
+        return bad, rest, left
     more = data.bad_pixels(left.acting)
     larger = more is not None and (bad is None or more.number > bad.number)
     return _without(data, more) if larger else (bad, rest, left)
 
 
 def _made(data: DataSet, bad: BadPixels) -> Inferred | None:
-    """Return what data say as they are if effects make their bad pixels, else None."""
+    """Return what data say as they are if effects that are named, or detected, make their bad pixels, else None."""
     if _left_beside(_unrefined(data), bad) > FEWER:
         return None
     found = inferred(data)
-    return None if _left_beside(found, bad) else found
+    named = found.refined.attribution.explanations or found.refined.partial is not None
+    return found if named and not _left_beside(found, bad) else None
 
 
 def _left_beside(found: Inferred, bad: BadPixels) -> float:

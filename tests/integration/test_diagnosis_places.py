@@ -120,7 +120,8 @@ def test_bad_pixels_that_a_residual_dipole_hides_are_left_out(spotted, monkeypat
     data = ObservedMaps(spotted, maps, ask)
     first = data.bad_pixels([])
     assert first.number < 20
-    monkeypatch.setattr(verdict, "inferred", lambda rest: SimpleNamespace(acting=[off]))
+    refined = SimpleNamespace(attribution=SimpleNamespace(verdict="effect"))
+    monkeypatch.setattr(verdict, "inferred", lambda rest: SimpleNamespace(acting=[off], refined=refined))
     found, rest, _ = verdict._without(data, first)
     assert [int(np.sum(one == healpy.UNSEEN)) for one in rest.data] == [0, 0, 20, 0]
     assert set(found.places[2]) == set(bad.tolist())
@@ -139,6 +140,15 @@ def test_what_a_nuisance_leaves_alone_does_not_stand_out():
     maps[2][SPOT] += 20.0 * data_of(plain).maps[2].noise_uk[SPOT]
     (place,) = left_out(ObservedMaps(known, maps, ask))
     assert place.startswith("One place of the residual of W1:half1 stands out")
+
+
+def test_effects_that_cannot_act_add_nothing_to_maps(small, shared):
+    """What fits an unknown gap best may be no beam: the diagnosis ended with that."""
+    maps = [map_uk.copy() for map_uk in simulate.maps(shared, 3)]
+    narrow = config.Effect(name="beam_width", channel="W1", parameters={"amplitude": -0.99})
+    assert left_out(ObservedMaps(small, maps, ask), narrow) == []
+    maps[1][SPOT] += 30.0 * shared.maps[1].noise_uk[SPOT]
+    assert len(left_out(ObservedMaps(small, maps, ask), narrow)) == 1
 
 
 def test_one_bright_pixel_is_said_of_its_own_map_alone(small, shared):

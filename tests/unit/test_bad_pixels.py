@@ -1,10 +1,13 @@
 """Bad pixels: which of what stands out is left out, and how they are said."""
 
+from types import SimpleNamespace
+
 import healpy
 import numpy as np
 import pytest
 
-from mcsim.datavector.bad_pixels import BadPixels, _largest
+from mcsim.datavector.bad_pixels import BadPixels, _largest, standing_out
+from mcsim.diagnosis import verdict
 
 NSIDE = 16
 
@@ -55,3 +58,35 @@ def test_whole_pixels_are_left_out_of_their_maps_alone(nside, hidden):
     assert np.all(left[0] == 0.0)
     assert np.sum(left[1] == healpy.UNSEEN) == hidden
     assert not maps[1].any()
+
+
+@pytest.mark.parametrize("nside", [16, 32])
+def test_beside_nuisances_residuals_count_over_the_noise_of_all_pixels_in_a_coarse_one(nside):
+    """Over the mean weight of fine pixels, maps of nside 32 were twice as wide as the noise that they hold."""
+    rng, precision = np.random.default_rng(1), 0.04
+    coarse = rng.normal(size=(1, 3072)) * np.sqrt(precision * (nside / NSIDE) ** 2)
+    model = SimpleNamespace(parts=[SimpleNamespace(precision=np.full(12 * nside**2, precision))])
+    none = np.zeros((1, 3072))
+    ensemble = SimpleNamespace(residual_mean=none, residual_scatter=none + 1.0, bipolar_scan=range(300), nuisances=1)
+    found, maps = standing_out(model, ensemble, coarse)
+    assert found == {}
+    assert np.std(maps) == pytest.approx(1.0, rel=0.05)
+
+
+@pytest.mark.parametrize(("explanations", "partial", "made"), [((), None, False), ((1,), None, True), ((), 1, True)])
+def test_what_is_neither_named_nor_detected_makes_no_bad_pixels(monkeypatch, explanations, partial, made):
+    """Noise with strong glitches, nearest of all candidates but not named, left bad pixels in, without a word."""
+    refined = SimpleNamespace(attribution=SimpleNamespace(explanations=explanations), partial=partial)
+    found = SimpleNamespace(refined=refined)
+    monkeypatch.setattr(verdict, "_unrefined", lambda _: found)
+    monkeypatch.setattr(verdict, "inferred", lambda _: found)
+    monkeypatch.setattr(verdict, "_left_beside", lambda *_: 0.0)
+    assert verdict._made(None, None) is (found if made else None)
+
+
+def test_no_more_is_looked_for_where_the_model_fits_the_rest(monkeypatch):
+    """Effects that fit chance best were simulated without a sky, for perfect maps as well."""
+    left = SimpleNamespace(refined=SimpleNamespace(attribution=SimpleNamespace(verdict="none")))
+    monkeypatch.setattr(verdict, "inferred", lambda _: left)
+    data = SimpleNamespace(bad_pixels=lambda _: pytest.fail("nothing is left to explain"))
+    assert verdict._without(data, None) == (None, data, left)
