@@ -333,8 +333,9 @@ def _contrast_blocks(model: Model) -> list[Block]:
     nside = 2 << max(top // 3, 1).bit_length() - 1
     height = np.abs(sine_of_latitude(model.frame, "galactic", nside))
     each = [((low, high), (height >= low) & (height <= high)) for low, high in pairwise(model.settings.latitude_edges)]
-    ranges = [ends for ends, band in each if band.any()]
-    bands = np.stack([band for _, band in each if band.any()]).astype(float)
+    if not (seen := [(ends, band) for ends, band in each if band.any()]):
+        return []
+    ranges, bands = [ends for ends, _ in seen], np.stack([band for _, band in seen]).astype(float)
     names = tuple(model.channels[c] for group in groups for c in group)
     alike = Element("contrast", "map", names, ell=(2, top), L=0, frame="galactic", kind="contrast")
     elements = tuple(

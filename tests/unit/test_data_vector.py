@@ -67,6 +67,9 @@ def test_bands_of_latitude_without_a_pixel_are_no_elements() -> None:
     assert [one.component for one in few.elements if one.kind == "contrast"] == ["|sin b| 0.03–0.95", "|sin b| 0.95–1"]
     vectors = [few.data_vector(list(simulate.maps(survey(few.run), number))) for number in range(3)]
     assert np.std(vectors, axis=0).min() > 0.0
+    settings = DiagnosisSettings(latitude_edges=(0.99, 1.0), large_scales=3)
+    none = analysis_of(config.load(two_channels("bands")), without=tuple(catalogue()), settings=settings)
+    assert "contrast" not in {one.kind for one in none.elements}
 
 
 def test_elements_are_of_degrees_that_the_maps_show() -> None:
