@@ -16,6 +16,7 @@ import mcsim
 from mcsim import cli, config
 from mcsim.datavector import campaign
 from mcsim.diagnosis import api
+from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.ensemble.external import source_of
 from mcsim.ensemble.external_maps import in_order, parts_of, stacked
 from mcsim.ensemble.maps import write_map
@@ -192,7 +193,7 @@ def test_its_effect_is_named_with_the_amplitude_that_was_put_in(learned):
     truth = 0.25
     maps = arrays_of(Plain().simulate(3, effects=[effect("beam_width", truth)]))
     data = api.ObservedMaps(learned, maps, lambda jobs: [api.data_vectors(job) for job in jobs])
-    found = api.diagnose_data(data, "wide")
+    found = diagnose_data(data, "wide")
     assert found.kind == "effect"
     assert found.effects[0].name == "beam_width"
     assert abs(found.effects[0].amplitude - truth) < 4 * found.effects[0].sigma
