@@ -35,6 +35,13 @@ class BadPixels:
         return sum(map(len, self.places.values()))
 
     @property
+    def left_out(self) -> str:
+        """Return how many pixels are left out, in words."""
+        return (
+            f"{self.number} pixels of nside {self.nside} are left out" if self.number > 1 else "its pixel is left out"
+        )
+
+    @property
     def size(self) -> float:
         """Return how far the first stands out, in units of the scatter of its map."""
         return max(size for sizes in self.places.values() for size in sizes.values())

@@ -32,12 +32,14 @@ def diagnosed(data: DataSet, case: str) -> tuple[DataSet | None, DiagnosisResult
     if bad is None:
         return data, left.result(case)
     if rest is data:
-        remedy = f"{LOOK_SO}: nothing is named before these pixels are left out; give the model a mask (map.mask)."
+        most = 100.0 * data.context.settings.missing_share
+        remedy = f"{LOOK_SO}. With what is UNSEEN these pixels are more than {most:g} % of a map, and nothing is named "
+        remedy += "before they are left out; give the model a mask (map.mask)."
         return None, left.result(case, *bad.sentences, remedy)
     if left.refined.attribution.verdict == "none":
         fits = f"{LOOK_SO}. Without these pixels the model fits (p = {rest.gap.pvalue:.2g})."
         return None, _unexplained(data).result(case, *bad.sentences, fits)
-    departs = f"{LOOK_SO}: they are left out of all that follows. With them the maps have p = {data.gap.pvalue:.2g}."
+    departs = f"{LOOK_SO}: {bad.left_out} of all that follows. Whole maps have p = {data.gap.pvalue:.2g}."
     return rest, left.result(case, *bad.sentences, departs)
 
 
