@@ -37,9 +37,8 @@ class BadPixels:
     @property
     def left_out(self) -> str:
         """Return how many pixels are left out, in words."""
-        return (
-            f"{self.number} pixels of nside {self.nside} are left out" if self.number > 1 else "its pixel is left out"
-        )
+        many = "one pixel" if self.number == 1 else f"{self.number} pixels"
+        return f"{many} of nside {self.nside} {'is' if self.number == 1 else 'are'} left out"
 
     @property
     def size(self) -> float:

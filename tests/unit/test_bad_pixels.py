@@ -39,6 +39,7 @@ def test_pixels_beside_a_larger_one_are_one_place():
     bad = of({1: {1000: 20.0, near[0]: 9.0, near[1]: 8.0, 40: 10.0}, 0: {7: 8.0}})
     assert (bad.number, bad.size) == (5, 20.0)
     assert bad.left_out == "5 pixels of nside 16 are left out"
+    assert of({0: {7: 8.0}}).left_out == "one pixel of nside 16 is left out"
     first, second = bad.sentences
     assert first.startswith("One place of the residual of V1 stands out, 8 times")
     assert second.startswith("2 places of the residual of W1 stand out, up to 20 times")
