@@ -15,7 +15,7 @@ from mcsim.diagnosis.assemble import result_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import as_seen
 from mcsim.diagnosis.found_noise import in_words, with_found_noise
-from mcsim.diagnosis.naming import agreeing, unconfirmed
+from mcsim.diagnosis.naming import agreeing, probable, unconfirmed
 from mcsim.diagnosis.partial import PartialSearch
 from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.result import DiagnosisResult
@@ -99,7 +99,8 @@ def inferred(data: DataSet) -> Inferred:
             refusals.append(why)
             found, reduction = found.unexplained(), None
     # What the rest of the data contradicts is not detected in it; after an unknown gap it was looked for already.
-    searched = instead or refusals or found.faint or refined.attribution.verdict == "unknown"
+    named = refined.attribution.if_named(context.settings)
+    searched = instead or (refusals and named.explanations) or found.faint or refined.attribution.verdict == "unknown"
     if found.verdict == "unknown" and not searched:
         detected = PartialSearch(data).run(refined.templates, refined.candidates)
     notes += refusals
@@ -113,14 +114,18 @@ def inferred(data: DataSet) -> Inferred:
 
 def _compared(data: DataSet, refined: Refined) -> tuple[DataSet, Refined, Attribution, list[str]]:
     """Return data and attribution with rivals that take part, what parts of the data bear out of it, and refusals."""
-    found, refusals = refined.attribution.if_named(data.context.settings), list[str]()
-    if found.explanations:
-        found, refusals = agreeing(data, refined, found)
+    found, refusals = _borne_out(data, refined)
     if (beside := with_rivals(data, refined, found)) is not None:
-        again, refused = agreeing(*beside, beside[1].attribution.if_named(data.context.settings))
+        again, refused = _borne_out(*beside)
         if again.explanations or found.explanations:
             return *beside, again, refused
     return data, refined, found, refusals
+
+
+def _borne_out(data: DataSet, refined: Refined) -> tuple[Attribution, list[str]]:
+    """Return the attribution as far as it is probable and parts of the data agree, and sentences on what is refused."""
+    found, refusals = probable(data.context, refined)
+    return agreeing(data, refined, found) if found.explanations else (found, refusals)
 
 
 def _has_noise(refined: Refined, found: Attribution) -> bool:

@@ -16,6 +16,18 @@ from mcsim.support.arrays import Matrix
 from mcsim.systematics import if_possible
 
 
+def probable(context: DiagnosisContext, refined: Refined) -> tuple[Attribution, list[str]]:
+    """Return the attribution if it is probable enough for names; if a single effect outweighs it, a sentence."""
+    whole = refined.attribution
+    found = whole.if_named(context.settings)
+    if found.explanations or found.faint or whole.rival is None or not whole.explanations:
+        return found, []
+    sets = "; and ".join(_title(context.candidates, one) for one in whole.explanations)
+    rival = context.candidates[whole.rival].title
+    why = f"{rival} is more probable ({1.0 - whole.probability:.2g}), though it does not suffice by itself"
+    return found, [f"The data vector fits {sets}, which is not named: {why}."]
+
+
 def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attribution, list[str]]:
     """Return the attribution without sets that the data cannot bear out, and a sentence on each of these.
 

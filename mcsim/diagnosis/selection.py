@@ -78,14 +78,17 @@ class Attribution:
     #: none of them; the three kinds (no effect, known, unknown) are equally probable before, and look-elsewhere is
     #: charged for
     probability: float = 1.0
-    faint: bool = False  #: True if that is too small for a name
+    #: effect alone that makes it small: it is more probable than no effect and an unknown one together, and does not
+    #: suffice
+    rival: int | None = None
+    faint: bool = False  #: True if it is too small for a name for another reason
     contradicted: tuple[Explanation, ...] = ()  #: sets that parts of the data contradict, or leave improbable
 
     def if_named(self, settings: DiagnosisSettings) -> "Attribution":
         """Return the attribution without its explanations if these are less probable than all else together."""
         if not self.explanations or self.probability >= settings.named_probability:
             return self
-        return replace(self.unexplained(), faint=True)
+        return replace(self.unexplained(), faint=self.rival is None or self.gap.pvalue > settings.faint_pvalue)
 
     def of(self, explanations: Sequence[Explanation]) -> "Attribution":
         """Return the attribution with some explanations, the most probable first, with odds against that one."""
@@ -133,6 +136,7 @@ def attribute(selection: "Selection", gap: GlobalTest | None = None) -> Attribut
     signal = null.hartlap_factor * delta_chi2[nearest] - groups.sizes[nearest]
     excess = max(null.hartlap_factor * float(y @ y) - null.dimension, signal, 1e-300)
     accepted = selection.accepted() if found.pvalue <= settings.alpha else []
+    probability, rival = selection.probability(accepted) if accepted else (0.0, None)
     explanations = tuple(selection.explanations(accepted))
     return Attribution(
         verdict=_verdict(found.pvalue > settings.alpha, explanations),
@@ -142,7 +146,8 @@ def attribute(selection: "Selection", gap: GlobalTest | None = None) -> Attribut
         cosine=float(np.sqrt(max(signal, 0.0) / excess)),
         singles=tuple(selection.fit(first, (place,)) for place in range(len(candidates))),
         contrasts=tuple(selection.contrasts(explanations)),
-        probability=selection.probability(accepted) if accepted else 0.0,
+        probability=probability,
+        rival=rival,
     )
 
 
@@ -201,13 +206,13 @@ class Selection:
             order = np.argsort(-shares)
             yield Contrast(first, second, float(np.sqrt(squared)), tuple(order.tolist()), tuple(shares[order].tolist()))
 
-    def probability(self, accepted: Sequence[_Accepted]) -> float:
-        """Return the posterior probability of accepted sets; see :class:`Attribution`.
+    def probability(self, accepted: Sequence[_Accepted]) -> tuple[float, int | None]:
+        """Return the posterior probability of accepted sets, and their rival; see :class:`Attribution`.
 
         A part of an accepted set is no rival of the names in it.
         """
         searches = self.searches
-        known = {found.members: found.evidence for found in accepted}
+        known = dict[tuple[int, ...], float]()
         for search in searches:
             for subsets in search.rows(1):
                 evidence = search.solve(subsets).evidence.tolist()
@@ -217,9 +222,11 @@ class Selection:
                     if not any(k in found.members for found in accepted)
                 )
                 known = {one.members: one.evidence for one in self._possible(alone)} | known
-        nothing = float(self.null.log_likelihood(searches[0].total))
-        everything = special.logsumexp([nothing, searches[0].unknown, *known.values()])
-        return float(np.exp(special.logsumexp([found.evidence for found in accepted]) - everything))
+        own = special.logsumexp([one.evidence for one in accepted])
+        others = special.logsumexp([-np.inf, *known.values()])
+        neither = np.logaddexp(self.null.log_likelihood(searches[0].total), searches[0].unknown)
+        rival = max(known, key=known.__getitem__)[0] if others > neither else None
+        return float(np.exp(own - special.logsumexp([own, others, neither]))), rival
 
     def accepted(self) -> list[_Accepted]:
         """Return minimal sufficient sets that are possible and whose evidence is not below the best by the cut.

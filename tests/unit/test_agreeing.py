@@ -1,5 +1,6 @@
 """No set of effects is named that was not compared in parts of the data."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -79,3 +80,19 @@ def test_where_nothing_is_left_nothing_is_compared():
     """With rivals of one split beside an unlisted effect, no set describes the data."""
     found = Attribution("unknown", None, (), 0, 1.0, (), (), 0.0)
     assert naming.agreeing(None, None, found) == (found, [])
+
+
+def test_a_set_that_an_effect_outweighs_is_refused_in_a_sentence_that_names_both():
+    candidates = [Candidate(systematics.get("calibration"), channel, (k,)) for k, channel in enumerate("ABC")]
+    fit = Fit(np.array([0.1]), np.eye(1) * 1e-6, 100.0, 100.0, 0.0, 1.0, 10, 0.5)
+    gap, context = SimpleNamespace(pvalue=1e-9), SimpleNamespace(settings=DiagnosisSettings(), candidates=candidates)
+    whole = Attribution("mixture", gap, (Explanation((0, 1), fit, 1.0, 0.5, 0.5),), 2, 1.0, (), (), 0.01, rival=2)
+    found, (sentence,) = naming.probable(context, SimpleNamespace(attribution=whole))
+    assert (found.verdict, found.faint) == ("unknown", False)
+    assert all(one.title in sentence for one in candidates)
+    assert "0.99" in sentence
+    whole = replace(whole, rival=None)
+    found, sentences = naming.probable(context, SimpleNamespace(attribution=whole))
+    assert (found.faint, sentences) == (True, [])
+    whole = replace(whole, probability=0.9)
+    assert naming.probable(context, SimpleNamespace(attribution=whole)) == (whole, [])

@@ -147,6 +147,24 @@ def test_a_faint_departure_is_not_named_and_a_clear_one_is(bench):
     assert not any(one.faint for one in clear)
 
 
+def test_what_an_effect_that_fails_outweighs_is_not_called_faint(bench):
+    """An accepted set far from the best single effect is improbable; what it fails for does not count here."""
+    settings = DiagnosisSettings()
+    for strength, outweighs in ((0.0, False), (40.0, True)):
+        x = strength * bench.t[:, 4] + np.random.default_rng(2).normal(size=P)
+        selection = Selection(bench.null, x, bench.t, bench.candidates, bench.calibration, settings)
+        worse = SimpleNamespace(members=(2, 7), evidence=selection.searches[0].solve(np.array([[2, 7]])).evidence[0])
+        probability, rival = selection.probability([worse])
+        assert probability < 0.5
+        assert rival == (4 if outweighs else None)
+        found = bench.diagnose_maps(40.0 * bench.t[:, 4], 0)
+        found = replace(found, probability=probability, rival=rival).if_named(settings)
+        assert found.verdict == "unknown"
+        assert found.faint != outweighs
+        several = [replace(found, rival=4, gap=replace(found.gap, pvalue=p)) for p in (0.02, 0.001)]
+        assert [replace(one, explanations=(None,)).if_named(settings).faint for one in several] == [True, False]
+
+
 @pytest.mark.slow
 def test_the_probability_of_a_name_is_the_rate_at_which_it_is_right():
     """Cases are drawn as it assumes: no effect as often as one of the library, with a strength from the prior."""
