@@ -307,6 +307,11 @@ class DiagnosisSettings:
         """
         return cls(**(_FIRST | changes))
 
+    @property
+    def strong_skies(self) -> int:
+        """Return how many skies tell the scatter of an effect on the data that outweighs that of the model."""
+        return max(self.constrained_skies, self.noisy_skies)
+
     def shrinks(self, simulations: int | None) -> bool:
         """Return True if the covariance from so many simulations, None for the default number, is shrunk."""
         return self.shrunk and simulations is None

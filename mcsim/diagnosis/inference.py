@@ -191,8 +191,7 @@ def _scattered(data: DataSet, candidates: Sequence[Candidate], members: Sequence
         acting = tables_at(context.candidates, members, first)
         groups, unknown = data.in_same_skies(acting), [one for one in acting if not context.knows(one)]
         pairs, scatter = _pairs(data, groups), data.in_same_skies(unknown)
-        few, more = context.settings.constrained_skies, context.settings.noisy_skies
-        for skies in (few, max(few, more)):
+        for skies in (context.settings.constrained_skies, context.settings.strong_skies):
             fit = first
             for pair in _pairs(data, scatter, skies):
                 fit = with_scatter(context.null, t, fit, *pair)

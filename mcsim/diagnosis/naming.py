@@ -129,7 +129,7 @@ def _actions(data: DataSet, refined: Refined, one: Explanation) -> Iterator[Acti
         acting, growth = None if draws else refined.candidates[member].acting, 1.0
         skies = context.settings.scatter_skies if draws else context.settings.constrained_skies
         if acting is not None and acting.own > GROWS:
-            skies = max(skies, context.settings.noisy_skies)
+            skies = context.settings.strong_skies
         pair: tuple[Matrix, Matrix] | None = None
         response = t @ theta
         with if_possible():

@@ -289,8 +289,7 @@ class Refiner:
             groups = [one.columns for one in now.candidates]
             acting = Acting.of(self.context.null, now.t, groups, index, pair)
             if acting.own > GROWS:
-                more = max(self.context.settings.constrained_skies, self.context.settings.noisy_skies)
-                pair = self.data.pair([there], more) or pair
+                pair = self.data.pair([there], self.context.settings.strong_skies) or pair
                 acting = Acting.of(self.context.null, now.t, groups, index, pair)
             if acting.own <= WIDE or how.noise_alone:
                 now.candidates[index] = replace(candidate, acting=acting, scatter=None)
