@@ -45,7 +45,8 @@ def write(score: Score, folder: Path) -> None:
         {"value": _value, "interval": _interval, "mark": _mark, "words": _words},
         score=score,
         metrics=_ordered(score),
-        short=[metric.name for metric in score.metrics if metric.met is False],
+        missed=[metric.name for metric in score.metrics if _mark(metric) == "missed"],
+        short=[metric.name for metric in score.metrics if _mark(metric) == "short"],
         open=sum(bool(metric.target) and metric.met is None for metric in score.metrics),
         confusions=[
             ("Diagnosis, all cases", everything),
@@ -63,7 +64,7 @@ def write(score: Score, folder: Path) -> None:
 
 def lines(score: Score) -> list[str]:
     """Return a head and the metrics for a terminal, those that miss their target first."""
-    return ["       figure: value [95 % interval] of so many cases; target"] + [
+    return ["       figure: value [95 % interval] of so many cases; target (short: the interval reaches it)"] + [
         f"{_mark(one):<6} {one.name}: {_value(one)}{f' [{_interval(one)}]' if _interval(one) else ''} of {one.count}"
         + (f"; target: {one.target}" if one.target else "")
         for one in _ordered(score)
@@ -86,11 +87,12 @@ def _plain(value: Any) -> Any:
 
 
 def _ordered(score: Score) -> list[Metric]:
-    return sorted(score.metrics, key=lambda metric: (False, True, None).index(metric.met))
+    return sorted(score.metrics, key=lambda metric: ("missed", "short", "met", "").index(_mark(metric)))
 
 
 def _mark(metric: Metric) -> str:
-    return {True: "met", False: "missed", None: ""}[metric.met]
+    """Return how a value stands to its target; "short" of one that its interval reaches."""
+    return "short" if metric.near else {True: "met", False: "missed", None: ""}[metric.met]
 
 
 def _value(metric: Metric) -> str:

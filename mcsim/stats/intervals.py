@@ -19,7 +19,8 @@ class Metric:
     """A measured number with its 95 % interval, and a target.
 
     ``count`` is the number of cases; value and ends of the interval are NaN where that is too small. The target is
-    in words, "" if there is none; ``met`` is None if there is none, or too few cases.
+    in words, "" if there is none; ``met`` is None if there is none, or too few cases. ``near`` is True if the interval
+    reaches a target that the value does not meet.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Metric:
     high: float = np.nan
     target: str = ""
     met: bool | None = None
+    near: bool = False
 
     def against(self, target: str, met: bool) -> "Metric":
         """Return the metric with a target and whether it is met, which is not known where there is no value."""
@@ -36,7 +38,8 @@ class Metric:
 
     def within(self, target: str, low: float = -np.inf, high: float = np.inf) -> "Metric":
         """Return the metric with a target that is met if the value is in a range."""
-        return self.against(target, low <= self.value <= high)
+        found = self.against(target, low <= self.value <= high)
+        return replace(found, near=found.met is False and self.low <= high and self.high >= low)
 
 
 def binomial_interval(k: int, n: int) -> tuple[float, float]:

@@ -26,6 +26,14 @@ def test_too_few_cases_meet_no_target():
     assert intervals.share("x", [True] * 18 + [False]).within("", 0.95).met is False
 
 
+def test_a_value_is_near_a_target_that_its_interval_reaches():
+    few, many = (intervals.share("x", [True] * 9 * n + [False] * n).within("", 0.95) for n in (2, 200))
+    assert [(one.met, one.near) for one in (few, many)] == [(False, True), (False, False)]
+    above = intervals.share("x", [True, *[False] * 99]).within("", high=0.05)
+    assert (above.met, above.near) == (True, False)
+    assert not intervals.share("x", []).within("", 0.95).near
+
+
 def test_ratios_are_those_of_the_sums():
     gone = intervals.removed("x", [(10.0, 1.0), (20.0, 2.0), (1e-9, 3.0)])
     assert gone.value == pytest.approx(0.8)
