@@ -99,7 +99,7 @@ def test_each_effect_of_a_set_scatters_the_skies_in_which_its_response_is_measur
 
     data: Any = SimpleNamespace(same_skies=same, pair=pair)
     data.in_same_skies = lambda found: ObservedMaps.in_same_skies(data, found)
-    settings = SimpleNamespace(nonlinear_sigma=0.5, constrained_skies=8, noisy_skies=24)
+    settings = SimpleNamespace(nonlinear_sigma=0.5, constrained_skies=8, strong_skies=24)
     known = {"null": null, "templates": t, "settings": settings}
     data.context = SimpleNamespace(candidates=candidates, knows=lambda table: False, **known)
     fit = null.fit(t @ [0.2, 0.1], t)
