@@ -55,8 +55,8 @@ class DiagnosisContext:
 
     @property
     def frame(self) -> str:
-        """Return the frame of the maps."""
-        return self.analysis.model.frame
+        """Return the frame that directions of effects are in: that of maps as they are made, which steps may turn."""
+        return self.run.map.frame
 
     @cached_property
     def cross_powers(self) -> CrossPowers:

@@ -10,6 +10,7 @@ import pytest
 
 import mcsim
 from mcsim import config
+from mcsim.config.preparation import Rotate
 from mcsim.datavector import campaign
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import api, report, words
@@ -159,3 +160,20 @@ def test_commands_prepare_maps_and_refuse_too_little_sky(mcsim, tmp_path, monkey
         assert said.count("\n") == 1
         assert "set sky.lmax to" in said
     assert {path.name for path in tmp_path.iterdir()} == {"V.fits", "enough.toml", "low.toml", "out"}
+
+
+def test_a_direction_is_told_in_the_frame_that_it_is_in():
+    """An effect acts on maps as they are made: its ecliptic direction was called galactic, as turned maps are."""
+    run = model(lmax=16, steps=False)
+    turning = (Rotate(frame="galactic"),)
+    run = replace(run, map=replace(run.map, mask=None, splits=("half1", "half2")), preparation=turning)
+    there = {"amplitude": 40.0, "lon_deg": 40.0, "lat_deg": 20.0}
+    acting = (config.Effect(name="dipole_residual", channel="V1", parameters=there),)
+    made = replace(run, ensemble=replace(run.ensemble, seed=9), effects=acting)
+    proposed = ("dipole_residual", "monopole_residual")
+    without = tuple(name for name in mcsim.effects() if name not in proposed)
+    settings = DiagnosisSettings(without=without, scan_sims=50, beam_orders=1, simulations=120)
+    found = mcsim.diagnose(run, list(simulate.maps(survey(made), 0)), settings=settings).sets[0].effects[0]
+    toward = healpy.ang2vec(found.parameters["lon_deg"], found.parameters["lat_deg"], lonlat=True)
+    assert np.rad2deg(np.arccos(toward @ healpy.ang2vec(40.0, 20.0, lonlat=True))) < 15.0
+    assert found.words.endswith("(ecliptic)")
