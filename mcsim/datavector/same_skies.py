@@ -124,8 +124,8 @@ class SameSkies:
     def _turned_back(self, sky: Alm, turned: Turned) -> Alm:
         """Return the sky of the model that effects of a run turn into a filtered one."""
         run, model = config.from_json(turned), self.analysis.model
-        site, frame = replace(model.survey.channels[0].site, lmax=model.lmax), model.survey.config.map.frame
-        acting = self._acting(model.survey.channels[0], run.effects)
+        first, frame = model.survey.making.channels[0], model.survey.config.map.frame
+        site, acting = replace(first.site, lmax=model.lmax), self._acting(first, run.effects)
         here = found = rotation.rotate_alm(sky, model.lmax, model.frame, frame)
         alone = systematics.looked_at(acting, 0.0 * sky, site, 0, 0)  # is taken from the maps
         for _ in range(ROUNDS):
@@ -278,9 +278,9 @@ class SameSkies:
     def dipole_left_uk(self, found: Sequence[config.Effect]) -> Vector:
         """Return the dipole that beams with effects leave in the only channel, uK, shape (3,); zero with several.
 
-        What a simulator of another program sees of a dipole is not known.
+        It is in the frame in which maps are made. What a simulator of another program sees of a dipole is not known.
         """
-        channels, known = self.analysis.model.survey.channels, DipoleResidual.name in dict(self.analysis.library)
+        channels, known = self.analysis.model.survey.making.channels, DipoleResidual.name in dict(self.analysis.library)
         if len(channels) > 1 or not known or self.analysis.source is not None:
             return np.zeros(3)
         before, after = (beam.blm[0, 1].real for beam in self._beams(channels[0], found))

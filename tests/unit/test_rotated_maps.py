@@ -1,5 +1,6 @@
 """Maps that a preparation turns into another frame: what is found in them acts on maps as they are made."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -10,14 +11,17 @@ from mcsim import config
 from mcsim.bipolar import power_spectrum
 from mcsim.datavector.analysis import analysis_of, simulated_maps
 from mcsim.datavector.campaign import constrained_jobs
+from mcsim.datavector.same_skies import SameSkies
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.shared_sky import shared_sky
 from mcsim.reconstruction.plugin import Plugin
 from mcsim.simulation import simulate
+from mcsim.simulation.channels import table_of
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix, real
 from mcsim.sphere.rotation import rotate_alm, rotation_matrix
+from mcsim.sphere.sky import gaussian_alm
 from mcsim.systematics import spacecraft
 
 LMAX = 20
@@ -119,3 +123,19 @@ def test_skies_that_turned_maps_constrain_are_these_skies():
     ell = np.arange(2, 11)  # where the sky is far above the noise
     left, power = (power_spectrum(one, one, LMAX)[ell] for one in (apart, observed))
     assert np.all(left < 0.1 * power)
+
+
+def test_a_modulation_of_turned_maps_is_undone_where_it_acted():
+    """A pattern that is known in galactic maps was not turned into the ecliptic ones that it acts on."""
+    table = two_channels("turned", lmax=LMAX, nside=16)
+    table["preparation"] = [{"kind": "rotate", "frame": "galactic"}]
+    pattern = tuple(0.02 * np.append(np.zeros(4), RANDOM[:5]))
+    values = {"coefficients": pattern, "on_dipole": False, "scope": "common", "frame": "galactic"}
+    kind = Plugin("unlisted_1", "GainPattern", "V1", values).kind()
+    analysis = analysis_of(config.load(table), library={kind.name: kind})
+    channel, skies = analysis.model.survey.making.channels[0], SameSkies(analysis, list, ())
+    sky = gaussian_alm(analysis.model.cl, np.random.default_rng(7))
+    seen = kind(amplitude=1.0).sky(sky, replace(channel.site, lmax=LMAX), None)
+    found = skies._turned_back(rotate_alm(seen, LMAX, *FRAMES), skies.turned([table_of(kind(amplitude=1.0), None)]))
+    apart = alm_.power(rotate_alm(found, LMAX, *FRAMES[::-1]) - sky, LMAX)[2:].sum()
+    assert apart < 0.01 * alm_.power(seen - sky, LMAX)[2:].sum()

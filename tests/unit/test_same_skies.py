@@ -222,6 +222,25 @@ def test_the_dipole_that_a_gain_leaves_in_the_only_channel_is_a_residual_one() -
     assert skies.dipole_left([config.Effect(name="noise_level", channel="V1", parameters={"amplitude": 0.1})]) == []
 
 
+def test_the_dipole_that_a_gain_leaves_in_turned_maps_is_that_of_maps_as_they_are_made() -> None:
+    """An effect acts on these: it had the galactic components of the dipole as ecliptic ones, 100 degrees off."""
+    table = two_channels("left", nside=8, lmax=16)
+    table["channel"] = table["channel"][:1]
+    others = [name for name in systematics.catalogue() if name != "calibration"]
+    found = []
+    for steps in ([], [{"kind": "rotate", "frame": "galactic"}]):
+        analysis = analysis_of(config.load(table | {"preparation": steps}), without=others)
+        gain = [config.Effect(name="calibration", channel="V1", parameters={"amplitude": 0.02})]
+        left = SameSkies(analysis, list, ()).dipole_left(gain)
+        made, expected = (
+            simulate.maps(survey(with_effects(analysis.run, own)), 0, sky=np.zeros(17 * 18 // 2, dtype=complex))
+            for own in (left, gain)
+        )
+        assert np.std(made - expected) < 1e-3 * np.std(expected)
+        found.append(left[0].parameters)
+    np.testing.assert_allclose(list(found[0].values()), list(found[1].values()), rtol=1e-9)
+
+
 def test_noise_alone_is_compared_in_all_skies_that_there_are_without_it() -> None:
     """What it adds to the scatter of the data is known from as many skies as were simulated."""
     settings = DiagnosisSettings.quick()
