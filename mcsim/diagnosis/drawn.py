@@ -41,7 +41,7 @@ def as_seen(context: DiagnosisContext, members: Sequence[int], found: Fit) -> It
         runs = (with_effects(analysis.run, [table]), analysis.run)
         with_it, without = (survey(run, library=dict(analysis.library)) for run in runs)
         changes = (simulate.maps(with_it, number) - simulate.maps(without, number) for number in range(PATTERNS))
-        rms = np.array([[np.std(own[pixels]) for own, pixels in zip(one, seen, strict=True)] for one in changes])
+        rms = np.sqrt([[np.mean(own[pixels] ** 2) for own, pixels in zip(one, seen, strict=True)] for one in changes])
         first = {model.channels[part.channel]: place for place, part in reversed([*enumerate(model.parts)])}
         each = [
             f"{measured(float(rms[:, place].mean()), float(rms[:, place].std(ddof=1)), ' µK')} in {channel}"
