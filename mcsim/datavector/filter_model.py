@@ -364,6 +364,12 @@ def _circular(channel: Channel, made: Channel) -> Cl:
     return np.asarray(own * np.divide(0.5 * (a + b), a, out=np.ones_like(a), where=a != 0.0))
 
 
+def smoothing(channel: Channel, lmax: int) -> Cl:
+    """Return what the preparation of a channel's maps multiplies its beam with, shape (lmax + 1,)."""
+    steps = channel.maps[0].preparation
+    return np.ones(lmax + 1) if steps is None else steps.beam_window(lmax)
+
+
 def sky_variance(cl: Cl, response: Cl) -> float:
     """Return the variance over the sky of a spectrum seen through B_l, in its unit."""
     return _variance(np.sqrt(cl) * response)

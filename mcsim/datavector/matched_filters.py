@@ -12,7 +12,7 @@ import numpy as np
 
 from mcsim import systematics
 from mcsim.bipolar import by_degree
-from mcsim.datavector.filter_model import Model
+from mcsim.datavector.filter_model import Model, smoothing
 from mcsim.datavector.wiener_filter import FilteredMaps
 from mcsim.simulation import differencing
 from mcsim.simulation.pixel_means import Part, drifts, gain_of, signal_of
@@ -70,8 +70,8 @@ def _no_draws(stage: str) -> np.random.Generator:
 
 
 def _beam_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter | None:
-    """Sum Re[conj(db_ls) D_s(l)] over the channel's maps, db_ls the change of the beam."""
-    owner, parts = model.survey.channels[channel], model.of(channel)
+    """Sum Re[conj(db_ls) D_s(l)] over the channel's maps, db_ls the change of the beam, smoothed as the maps are."""
+    owner, parts = model.survey.making.channels[channel], model.of(channel)
     lmax, top = model.lmax, model.settings.beam_orders
     changed, before = systematics.seen_through((effect,), owner.site), owner.site.beam
     change = np.zeros((top + 1, lmax + 1), dtype=np.complex128)
@@ -81,11 +81,12 @@ def _beam_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter | 
     spread = effect.spread()
     if spread != 1.0:
         # Samples that stand closer change the window of their pixels, not that of a preparation.
-        window = np.maximum(model.survey.making.channels[channel].window[: lmax + 1], np.finfo(float).tiny)
+        window = np.maximum(owner.window[: lmax + 1], np.finfo(float).tiny)
         rows = min(before.mmax, top) + 1
         change[:rows] += before.blm[:rows, : lmax + 1] * (window ** (spread * spread - 1.0) - 1.0)
     if not change.any():
         return None  # samples at the centres of their pixels, with no pixel window, cannot come closer
+    change *= smoothing(owner, lmax)
 
     def value(filtered: FilteredMaps) -> float:
         total = sum(filtered.orders[i] for i in parts)

@@ -13,7 +13,7 @@ from mcsim import config, systematics
 from mcsim.datavector.added_maps import Added, AddedMaps
 from mcsim.datavector.analysis import Analysis, Job
 from mcsim.datavector.campaign import Ask, after_jobs, constrained_jobs, without_repeats
-from mcsim.datavector.filter_model import Model, seen_through
+from mcsim.datavector.filter_model import Model, seen_through, smoothing
 from mcsim.datavector.shared_sky import shared_sky
 from mcsim.instrument.beams import Beam
 from mcsim.simulation import convolve
@@ -216,15 +216,15 @@ class SameSkies:
     def orders(self, found: Sequence[config.Effect]) -> Orders:
         """Return what effects add to the orders m > 0 of the beams; () if all is little."""
         model, rows = self.analysis.model, []
-        for channel, made in zip(model.survey.channels, model.survey.making.channels, strict=True) if found else ():
-            before, after = (beam.blm[:, : model.lmax + 1] for beam in self._beams(channel, found))
+        for made in model.survey.making.channels if found else ():
+            before, after = (beam.blm[:, : model.lmax + 1] for beam in self._beams(made, found))
             change = np.zeros((max(len(before), len(after)), model.lmax + 1), dtype=np.complex128)
             change[: len(after)] += after
             change[: len(before)] -= before
             change[0] = 0.0
             little = np.abs(change).max() == 0.0 or made.side_b is not None
             little = little or divided(np.abs(change).max(axis=0), np.abs(before[0])).max() <= ASKEW
-            rows.append(b"" if little else change.tobytes())
+            rows.append(b"" if little else (change * smoothing(made, model.lmax)).tobytes())
         return tuple(rows) if any(rows) else ()
 
     def _acting(self, channel: Channel, found: Sequence[config.Effect]) -> list[systematics.Effect]:
@@ -232,9 +232,9 @@ class SameSkies:
         own = [one for one in found if one.channel in (None, channel.name)]
         return [systematics.build(library[one.name], dict(one.parameters)) for one in own]
 
-    def _beams(self, channel: Channel, found: Sequence[config.Effect]) -> tuple[Beam, Beam]:
-        """Return the beam of a channel without effects on its shape and with them."""
-        return channel.site.beam, systematics.seen_through(self._acting(channel, found), channel.site, displacing=())
+    def _beams(self, made: Channel, found: Sequence[config.Effect]) -> tuple[Beam, Beam]:
+        """Return the beam of a channel without effects on its shape and with them, before maps are prepared."""
+        return made.site.beam, systematics.seen_through(self._acting(made, found), made.site, displacing=())
 
     def factors(self, found: Sequence[config.Effect]) -> Factors:
         """Return by how much effects change what each channel sees, by degree; () if all is close to 1.
@@ -242,10 +242,10 @@ class SameSkies:
         It is one number for all degrees where the effects rescale the channel as a whole.
         """
         model, rows = self.analysis.model, []
-        for channel, made in zip(model.survey.channels, model.survey.making.channels, strict=True) if found else ():
-            acting = self._acting(channel, found)
-            row = np.full(model.lmax + 1, systematics.rescaling(acting, channel.site))
-            before, after = (beam.blm[0, : model.lmax + 1].real for beam in self._beams(channel, found))
+        for made in model.survey.making.channels if found else ():
+            acting = self._acting(made, found)
+            row = np.full(model.lmax + 1, systematics.rescaling(acting, made.site))
+            before, after = (beam.blm[0, : model.lmax + 1].real for beam in self._beams(made, found))
             shape = np.where(before > 0.0, divided(after, before), 1.0)
             shape *= made.seen_window[: model.lmax + 1] ** (systematics.spread_of(acting) ** 2 - 1.0)
             rows.append(shape if np.abs(shape / row - 1.0).max() > BENT else row)
