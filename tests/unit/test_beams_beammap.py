@@ -293,6 +293,24 @@ def test_unusable_map_is_refused(tmp_path, change, options, named) -> None:
         Beam.from_map(read_map(path, **options), **{"lmax": 100, **degrees})
 
 
+@pytest.mark.parametrize("share", [0.9, 1.0])
+def test_a_map_whose_negative_response_cancels_the_positive_is_refused(share) -> None:
+    offset = 0.1 * (np.arange(81) - 40)
+    image = np.exp(-np.add.outer(offset**2, offset**2) / 2)
+    inside = np.hypot(*np.meshgrid(offset, offset)) < 3.5
+    image[inside] -= share * image[inside].mean()
+    with refused("B_l", "l = ", 2.0):
+        Beam.from_map(image, 64, pixel_deg=0.1)
+
+
+def test_a_map_with_as_much_negative_response_as_wmap_s_is_kept() -> None:
+    offset = 0.1 * (np.arange(81) - 40)
+    image = np.exp(-np.add.outer(offset**2, offset**2) / 2)
+    inside = np.hypot(*np.meshgrid(offset, offset)) < 3.5
+    image[inside] -= 0.1 * image[inside].mean()
+    assert np.abs(Beam.from_map(image, 64, pixel_deg=0.1).window).max() == pytest.approx(1.0)
+
+
 def test_steps_in_a_matrix_are_those_of_the_pixels(tmp_path) -> None:
     """astropy writes a matrix CD as PC beside CDELT = 1, which made pixels of a degree of any."""
     wcs = WCS(naxis=2)

@@ -22,6 +22,7 @@ from mcsim.support.npy import read_npz
 
 LEAST_NORMALISED = 1e-6  #: largest departure of B_0 from 1: that of coefficients in single precision is smaller
 DEFAULT_LMAX = 2048  #: largest degree of a beam where none is asked for
+LARGEST_WINDOW = 2.0  #: of |B_l| over B_0: reached if negative response is a third of the positive one, or more
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -331,7 +332,8 @@ class Beam:
 
         ``blm`` has the shape (>= mmax + 1, lmax + 1), to the largest order that is known; ``mmax`` is the order to cut
         at (None: that of :func:`choose_mmax`), ``origin`` says in messages what they are of. Raise InputError if a
-        coefficient is not finite, the integral of the beam is not positive, or it has no order ``mmax``.
+        coefficient is not finite, the integral of the beam is not positive or so small that some B_l is above
+        ``LARGEST_WINDOW``, or it has no order ``mmax``.
         """
         if not np.all(np.isfinite(blm)):
             raise InputError(f"{origin} has coefficients that are not finite: repair it before use")
@@ -343,6 +345,12 @@ class Beam:
             if mmax >= len(blm):
                 raise InputError(f"mmax = {mmax} exceeds the largest order {len(blm) - 1} of {origin}: lower mmax")
         whole = cls(blm / integral, integral=integral)
+        degree = int(np.argmax(np.abs(whole.window)))
+        if abs(whole.window[degree]) > LARGEST_WINDOW:
+            raise InputError(
+                f"{origin} has B_l = {whole.window[degree]:.3g} B_0 at l = {degree}, where at most {LARGEST_WINDOW:g} "
+                "can be a beam's: its negative response nearly cancels the positive one; take off no mean"
+            )
         return whole.truncated(choose_mmax(blm) if mmax is None else mmax)
 
     @property
