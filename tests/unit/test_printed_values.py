@@ -15,6 +15,7 @@ from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.ensemble.describe import describe_prediction
 from mcsim.information.result import Limits
 from mcsim.instrument.beams import Beam
+from mcsim.instrument.scan import Moments
 from mcsim.stats.excess import HeldOut, Measured
 from mcsim.support.numbers import duration, measured, number, probability
 
@@ -124,6 +125,8 @@ def test_results_print_as_a_line() -> None:
     expected = "<DiagnosisResult first: degenerate, p = 1.2e-05, ellipticity of W1; or coma of W1>"
     assert DiagnosisResult.__repr__(found) == expected
     assert repr(Beam.gaussian(60.0, 100)) == "<Beam: lmax = 100, mmax = 0>"
+    still = Moments.parallel_transport(nside=4, smax=2)
+    assert repr(still) == "<Moments: nside = 4, ecliptic frame, smax = 2, 192 hits>"
     limits = SimpleNamespace(model="small", lines=lambda: ["effect  sigma", "gain  0.01"])
     assert Limits.__repr__(limits).splitlines() == ["<Limits of small>", "effect  sigma", "gain  0.01"]
 

@@ -29,7 +29,7 @@ _ARRAYS = ("hits", "w", "dtheta", "dphi", "offset_moments")
 _PIXELS = 1 << 18  #: whose centroids are computed at once, to save memory
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Moments:
     """Hits, orientation moments and centroids of every pixel, in RING order.
 
@@ -63,6 +63,10 @@ class Moments:
     dtheta: NDArray[np.float64] | None = None
     dphi: NDArray[np.float64] | None = None
     offset_moments: NDArray[np.float64] | None = None
+
+    def __repr__(self) -> str:
+        """Return resolution, frame and what is known, in a line; not the arrays."""
+        return f"<Moments: nside = {self.nside}, {self.frame} frame, smax = {self.smax}, {self.hits.sum():.6g} hits>"
 
     def __post_init__(self) -> None:
         """Raise InputError unless frame, nside and the sizes of the arrays agree."""
