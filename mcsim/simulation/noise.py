@@ -20,6 +20,7 @@ from mcsim.sphere import header, map_files
 from mcsim.sphere.checks import UNSEEN_BELOW, check_not_infinite
 from mcsim.sphere.mask import kept_mask
 from mcsim.support.arrays import Map, divided
+from mcsim.support.numbers import measured
 
 SMALLEST_UK2 = 1e-8
 """Largest variance of a map of variances, and mean square of a map of noise, at least.
@@ -55,7 +56,7 @@ class Level:
         """Say it in words."""
         per = "per pixel of a split" if self.isotropic else "per observation"
         return (
-            f"{self.sigma_uk:.6g} +- {self.error_uk:.2g} uK {per}, from the differences of {self.splits} splits in "
+            f"{measured(self.sigma_uk, self.error_uk, ' uK')} {per}, from the differences of {self.splits} splits in "
             f"{self.pixels} pixels"
         )
 

@@ -13,6 +13,7 @@ from mcsim.ensemble.expectation import noise_mean
 from mcsim.simulation import simulate
 from mcsim.simulation.noise import difference_level
 from mcsim.simulation.survey import survey
+from mcsim.support.numbers import measured
 from refusals import refused
 
 NSIDE = 32
@@ -106,7 +107,9 @@ def test_hits_stand_beside_the_temperature_and_the_plan_says_the_level(observed,
     run = run_with({"kind": "difference", "maps": paths})
     level = difference_level(run, "W")
     assert abs(level.sigma_uk - SIGMA) < 4.0 * level.error_uk
-    assert f"noise   W {level.sigma_uk:.6g} +-" in "\n".join(plan.cost(run).lines(2, 1))
+    assert f"noise   W {measured(level.sigma_uk, level.error_uk, ' uK')} per observation" in "\n".join(
+        plan.cost(run).lines(2, 1)
+    )
 
 
 @pytest.mark.parametrize("columns", [{"TEMPERATURE": "mK"}, None], ids=["fits", "npy"])
