@@ -44,9 +44,9 @@ def _realization(nside: int, lmax: int, repeats: int) -> Iterator[str]:
 
     transforms(1, 1)
     yield (
-        f"  spin-0 synthesis {_seconds(healpix.synthesis, alms[:1], nside, lmax):.3f} s, "
-        f"spin-2 synthesis {_seconds(healpix.synthesis, alms, nside, lmax, 2):.3f} s, "
-        f"analysis {_seconds(healpix.analysis, map_uk, lmax):.3f} s (ring weights: 1 adjoint synthesis)"
+        f"  spin-0 synthesis {_seconds(healpix.synthesis, alms[:1], nside, lmax):.3g} s, "
+        f"spin-2 synthesis {_seconds(healpix.synthesis, alms, nside, lmax, 2):.3g} s, "
+        f"analysis {_seconds(healpix.analysis, map_uk, lmax):.3g} s (ring weights: 1 adjoint synthesis)"
     )
     for label, sigma0_uk, scalars, analyses in (
         ("noise-free over spin-0 + spin-2 synthesis and 2 analyses", 0.0, 1, 2),
@@ -58,7 +58,7 @@ def _realization(nside: int, lmax: int, repeats: int) -> Iterator[str]:
         bare, whole = np.array(
             [(_seconds(transforms, scalars, analyses), _seconds(simulate.realize, shared, r)) for r in range(repeats)]
         ).T
-        yield f"  realization {label}: ratio {np.median(whole / bare):.2f}, {np.median(whole):.2f} s"
+        yield f"  realization {label}: ratio {np.median(whole / bare):.2f}, {np.median(whole):.3g} s"
 
 
 def _workers(nside: int, lmax: int, realizations: int) -> Iterator[str]:
