@@ -125,7 +125,7 @@ def get(name: str, library: Library | None = None) -> type[Effect]:
         return of_file(name)
     known = catalogue() if library is None else library
     if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
+        near = difflib.get_close_matches(name, known, n=1, cutoff=0.7)  # at 0.6 "nonsense" is noise_knee
         hint = f"did you mean {near[0]}?" if near else f"choose from {', '.join(sorted(known))}."
         raise InputError(f"there is no effect {name!r}; {hint}")
     return known[name]

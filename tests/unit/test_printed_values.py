@@ -18,6 +18,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments
 from mcsim.stats.excess import HeldOut, Measured
 from mcsim.support.numbers import duration, measured, number, probability
+from refusals import refused
 
 
 @pytest.mark.parametrize(
@@ -147,3 +148,11 @@ def test_a_forecast_is_quoted_where_it_says_something(sigma: float, quoted: bool
     said = words.held_out(SimpleNamespace(held_out=reduction))
     assert ("90 %" in said) == quoted
     assert "70 % ± 10 %" in said
+
+
+def test_only_an_effect_of_nearly_that_name_is_suggested() -> None:
+    """At the usual likeness "nonsense" was taken for noise_knee."""
+    with refused("beam_widht", "beam_width?"):
+        systematics.get("beam_widht")
+    with refused("nonsense", "beam_coma"):  # all of them
+        systematics.get("nonsense")
