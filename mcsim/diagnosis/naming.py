@@ -24,7 +24,8 @@ def probable(context: DiagnosisContext, refined: Refined) -> tuple[Attribution, 
         return found, []
     sets = "; and ".join(_title(context.candidates, one) for one in whole.explanations)
     rival = context.candidates[whole.rival].title
-    why = f"{rival} is more probable ({1.0 - whole.probability:.2g}), though it does not suffice by itself"
+    rest = f"all else together has a probability of {1.0 - whole.probability:.2g}"
+    why = f"{rival}, which does not suffice by itself, is more probable ({rest})"
     return found, [f"The data vector fits {sets}, which is not named: {why}."]
 
 
