@@ -14,7 +14,7 @@ from mcsim import systematics
 from mcsim.bipolar import by_degree
 from mcsim.datavector.filter_model import Model, smoothing
 from mcsim.datavector.wiener_filter import FilteredMaps
-from mcsim.simulation import differencing
+from mcsim.simulation import differencing, windows
 from mcsim.simulation.pixel_means import Part, drifts, gain_of, signal_of
 from mcsim.simulation.survey import Channel, SurveyMap
 from mcsim.sphere import healpix
@@ -81,9 +81,9 @@ def _beam_filter(model: Model, effect: Effect, channel: int) -> MatchedFilter | 
     spread = effect.spread()
     if spread != 1.0:
         # Samples that stand closer change the window of their pixels, not that of a preparation.
-        window = np.maximum(owner.window[: lmax + 1], np.finfo(float).tiny)
-        rows = min(before.mmax, top) + 1
-        change[:rows] += before.blm[:rows, : lmax + 1] * (window ** (spread * spread - 1.0) - 1.0)
+        rows, own = min(before.mmax, top) + 1, np.maximum(owner.window, np.finfo(float).tiny)
+        factor = windows.stretched(owner.window, owner.site.nside, spread) / own
+        change[:rows] += before.blm[:rows, : lmax + 1] * (factor[: lmax + 1] - 1.0)
     if not change.any():
         return None  # samples at the centres of their pixels, with no pixel window, cannot come closer
     change *= smoothing(owner, lmax)

@@ -16,7 +16,7 @@ from mcsim.datavector.campaign import Ask, after_jobs, constrained_jobs, without
 from mcsim.datavector.filter_model import Model, seen_through, smoothing
 from mcsim.datavector.shared_sky import shared_sky
 from mcsim.instrument.beams import Beam
-from mcsim.simulation import convolve
+from mcsim.simulation import convolve, windows
 from mcsim.simulation.channels import table_of
 from mcsim.simulation.survey import Channel
 from mcsim.sphere import alm as alm_
@@ -247,7 +247,8 @@ class SameSkies:
             row = np.full(model.lmax + 1, systematics.rescaling(acting, made.site))
             before, after = (beam.blm[0, : model.lmax + 1].real for beam in self._beams(made, found))
             shape = np.where(before > 0.0, divided(after, before), 1.0)
-            shape *= made.seen_window[: model.lmax + 1] ** (systematics.spread_of(acting) ** 2 - 1.0)
+            there = windows.stretched(made.window, made.site.nside, systematics.spread_of((*made.effects, *acting)))
+            shape *= divided(there, made.seen_window)[: model.lmax + 1]
             rows.append(shape if np.abs(shape / row - 1.0).max() > BENT else row)
         return (
             () if all(np.abs(row - 1.0).max() <= SMALL for row in rows) else tuple(tuple(row.tolist()) for row in rows)

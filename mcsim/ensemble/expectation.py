@@ -100,7 +100,7 @@ def nearer(survey: Survey, channel: Channel) -> Cl:
     That of a preparation, which is in the window of the channel too, is not of samples and stays.
     """
     made = next(one for one in survey.making.channels if one.name == channel.name)
-    return np.asarray(made.window ** (systematics.spread_of(channel.effects) ** 2 - 1.0))
+    return np.asarray(made.seen_window / made.window)
 
 
 def _check_covered(channel: Channel) -> None:

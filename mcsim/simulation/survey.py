@@ -12,7 +12,7 @@ from mcsim.bipolar import Estimator, estimator
 from mcsim.errors import InputError
 from mcsim.instrument import beams, scan
 from mcsim.instrument.scan import MapGrid
-from mcsim.simulation import convolve, mapmaking
+from mcsim.simulation import convolve, mapmaking, windows
 from mcsim.simulation.channels import (
     effects_on,
     in_channel,
@@ -115,9 +115,8 @@ class Channel:
 
     @property
     def seen_window(self) -> NDArray[np.float64]:
-        """Pixel window of samples where effects leave them: it is a Gaussian in all but name, (lmax + 1,)."""
-        spread = spread_of(self.effects)
-        return np.asarray(self.window ** (spread * spread))
+        """Pixel window of samples where effects leave them, (lmax + 1,)."""
+        return windows.stretched(self.window, self.site.nside, spread_of(self.effects))
 
 
 @dataclass(frozen=True)
@@ -268,9 +267,7 @@ def _channel(
         gain, signal_uk = gain_of_all(acting, site, part, beam.mmax), signal_of_all(acting, site, part)
         steady = shared_gain(acting, replace(site, split=split))
         maps.append(replace(m, gain=gain, steady_gain=steady, signal_uk=signal_uk))
-    # A pixel whose samples keep closer to its centre blurs less; the window is a Gaussian in all but name.
-    spread = spread_of(acting)
-    seen_window = window ** (spread * spread)
+    seen_window = windows.stretched(window, site.nside, spread_of(acting))  # samples closer to centres blur less
     response = convolve.response(beam, run.sky.lmax, seen_window)
     side_b = _side_b(spec, seen_window, site, acting)
     return Channel(spec.name, beam, response, window, tuple(maps), site, acting, side_b)

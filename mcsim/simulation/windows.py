@@ -22,6 +22,20 @@ def of_pixels(nside: int, lmax: int) -> Window:
     return window
 
 
+def stretched(window: Window, nside: int, spread: float) -> Window:
+    """Return a pixel window where samples stand ``spread`` times as far from their pixels' centres, (lmax + 1,).
+
+    In pixels so much larger the sky looks as it does at lower degrees in theirs: l (l + 1) counts spread^2 times. It is
+    a Gaussian in all but name, w^(spread^2); by how much it departs from one is that of the computed window. Ones stay.
+    """
+    power, lmax = spread * spread, window.size - 1
+    if power == 1.0 or np.all(window == 1.0):
+        return window
+    own = healpix.pixel_window(nside, lmax * int(np.ceil(max(abs(spread), 1.0))))
+    there = np.sqrt(0.25 + power * np.arange(lmax + 1.0) * np.arange(1.0, lmax + 2.0)) - 0.5
+    return np.asarray(np.interp(there, np.arange(own.size), own) * (window / own[: lmax + 1]) ** power)
+
+
 @lru_cache(maxsize=8)
 def of_average(fine: int, coarse: int, lmax: int) -> Window:
     """Return the window of the plain mean of the fine pixels' centres inside the coarse ones, shape (lmax + 1,).

@@ -15,7 +15,7 @@ from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import MapGrid, Moments, ScanModel, read_moments, write_moments_fits
 from mcsim.instrument.scan.offsets import exponents
 from mcsim.instrument.scan.pointing import pointing
-from mcsim.simulation import sampled, simulate
+from mcsim.simulation import sampled, simulate, windows
 from mcsim.simulation.offsets import Expansion, expansion, offset_maps, transforms
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
@@ -224,6 +224,17 @@ def test_a_run_takes_the_powers_it_asks_for(sky, beam, streamed) -> None:
     np.testing.assert_array_equal(simulate.maps(survey(plain), 0)[0], mcsim.observe(sky, beam, own.up_to_offsets(1)))
     one, two = (config.load(table(streamed, beam, sky, offset_order=order)) for order in (1, 2))
     assert config.digest(one) == config.digest(plain) != config.digest(two)
+
+
+@pytest.mark.parametrize(("nside", "wide", "apart"), [(64, 32, 2.0), (32, 64, 0.5)])
+def test_samples_farther_from_the_centres_have_the_window_of_larger_pixels(nside, wide, apart) -> None:
+    """Of pixels of another resolution, which have other shapes; as a power of their window it is 30 times as far."""
+    own, other = (healpix.pixel_window(one, 160) for one in (nside, wide))
+    assert np.abs(windows.stretched(own, nside, apart) - other).max() < 1.5e-3
+    assert np.abs(own ** (apart * apart) - other).max() > 0.02
+    for same, spread in ((own, 1.0), (own, -1.0), (np.ones(161), apart)):
+        assert np.array_equal(windows.stretched(same, nside, spread), same)
+    np.testing.assert_allclose(windows.stretched(own, nside, 0.0), 1.0, atol=1e-6)
 
 
 def test_spread_to_nothing_is_a_survey_of_centres(sky, beam, streamed) -> None:
