@@ -12,7 +12,6 @@ from mcsim.diagnosis.drawn import is_drawn
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.stats.scattered import GROWS
-from mcsim.support.arrays import Matrix
 from mcsim.systematics import if_possible
 
 
@@ -22,11 +21,10 @@ def probable(context: DiagnosisContext, refined: Refined) -> tuple[Attribution, 
     found = whole.if_named(context.settings)
     if found.explanations or found.faint or whole.rival is None or not whole.explanations:
         return found, []
-    sets = "; and ".join(_title(context.candidates, one) for one in whole.explanations)
     rival = context.candidates[whole.rival].title
     rest = f"all else together has a probability of {1.0 - whole.probability:.2g}"
     why = f"{rival}, which does not suffice by itself, is more probable ({rest})"
-    return found, [f"The data vector fits {sets}, which is not named: {why}."]
+    return found, [_doubt(context.candidates, whole.explanations, why)]
 
 
 def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attribution, list[str]]:
@@ -52,7 +50,7 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
             if len(frequencies) == 1:
                 refused.append(one)
                 why = "at a single frequency it looks like any signal that is fixed to the sky"
-                sentences.append(f"The data vector fits {_title(candidates, one)}, which is not named: {why}.")
+                sentences.append(_doubt(candidates, [one], why))
                 continue
         elif len(kept) < settings.compared_sets:
             one = replace(one, findings=slices.findings(members, list(_actions(data, refined, one))))
@@ -67,15 +65,14 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
         left_out = not _is_as_probable(one, agreed, settings.odds_cut)
         (refused if left_out else kept).append(replace(one, odds=one.odds * one.findings.bound))
         named = "is not named" if left_out else "stays in the set, for it is hardly told from what all parts agree with"
-        sentences.append(f"The data vector fits {_title(candidates, one)}, which {named}: {doubt}.")
+        sentences.append(_doubt(candidates, [one], doubt, named))
     # The weight of what falls away goes to all else.
     own, rest = (found.probability * sum(one.odds for one in each) / whole for each in (kept, refused))
     probability = own / (own + rest + 1.0 - found.probability) if own else 0.0
     left = replace(found.of(kept), probability=probability, contradicted=tuple(refused))
     if kept and probability < settings.named_probability:
-        sets = "; and ".join(_title(candidates, one) for one in left.explanations)
         why = f"beside what fell away the probability of all that is left is {probability:.2g}"
-        sentences.append(f"The data vector fits {sets}, which is not named: {why}.")
+        sentences.append(_doubt(candidates, left.explanations, why))
         left = replace(left.unexplained(), contradicted=(*refused, *left.explanations))
     return left, sentences
 
@@ -90,8 +87,10 @@ def _is_as_probable(one: Explanation, agreed: Sequence[Explanation], cut: float)
     return len(one.members) <= fewest and one.odds * one.findings.bound >= least
 
 
-def _title(candidates: Sequence[Candidate], one: Explanation) -> str:
-    return " and ".join(candidates[member].title for member in one.members)
+def _doubt(candidates: Sequence[Candidate], sets: Sequence[Explanation], why: str, named: str = "is not named") -> str:
+    """Return a sentence on sets that fit the data vector and are not simply named."""
+    titles = (" and ".join(candidates[member].title for member in one.members) for one in sets)
+    return f"The data vector fits {'; and '.join(titles)}, which {named}: {why}."
 
 
 def slices_of(data: DataSet) -> Slices:
@@ -110,10 +109,9 @@ def unconfirmed(context: DiagnosisContext, found: Attribution, reduced: bool) ->
     if found.verdict != "effect" or reduced:
         return ""
     (one,) = found.explanations
-    candidate = context.candidates[one.members[0]]
-    if is_drawn(candidate) or one.findings.measured:
+    if is_drawn(context.candidates[one.members[0]]) or one.findings.measured:
         return ""
-    return f"The data vector fits {candidate.title}, which is not named: no two parts of the data measure it."
+    return _doubt(context.candidates, [one], "no two parts of the data measure it")
 
 
 def _actions(data: DataSet, refined: Refined, one: Explanation) -> Iterator[Action]:
@@ -121,29 +119,25 @@ def _actions(data: DataSet, refined: Refined, one: Explanation) -> Iterator[Acti
 
     What is drawn, and a map-making that stops early, which leaves noise as well as sky, differ from sky to sky.
     """
-    context, bank, sites = data.context, data.context.bank, data.context.analysis.model.survey.channels
+    context, bank, settings = data.context, data.context.bank, data.context.settings
+    sites = [channel.site for channel in context.analysis.model.survey.channels]
     whole = np.concatenate([refined.templates, bank.slice_matrix]) if len(bank.slice_matrix) else refined.templates
     for member, theta, covariance in parts_of(context.candidates, one.members, one.fit):
-        candidate = context.candidates[member]
-        t = whole[:, list(candidate.columns)]
-        draws, scatter = refined.candidates[member].scatter is not None or candidate.parametrization.nonlinear, None
-        acting, growth = None if draws else refined.candidates[member].acting, 1.0
-        skies = context.settings.scatter_skies if draws else context.settings.constrained_skies
-        if acting is not None and acting.own > GROWS:
-            skies = context.settings.strong_skies
-        pair: tuple[Matrix, Matrix] | None = None
-        response = t @ theta
+        candidate, tried = context.candidates[member], refined.candidates[member]
+        draws = tried.scatter is not None or candidate.parametrization.nonlinear
+        added = 0.0 if draws or tried.acting is None else max(tried.acting.own, 0.0)
+        few = settings.strong_skies if added > GROWS else settings.constrained_skies
+        t, growth, scatter = whole[:, list(candidate.columns)], 1.0, None
+        response, pair = t @ theta, None
         with if_possible():
             effect = candidate.detected(theta, covariance)
             table = candidate.table(effect)
-            simulated = data.pair_extended([table], skies)
-            changes = simulated[1] - simulated[0]
-            own = (effect.noise(one.site) for one in sites if candidate.channel in (None, one.site.channel))
-            if not (known := context.knows(table)):
-                growth = max([1.0, *(float(np.mean(one)) for one in own if one is not None)])
-            response, scatter = changes.mean(axis=0), data.scatter(changes) if draws else None
-            if not (draws or known):  # else its scatter is in the covariance
-                pair = simulated
-        variance = 1.0 if acting is None else 1.0 + max(acting.own, 0.0)
-        action = Action.of(response, t, theta, variance * covariance, scatter)
-        yield replace(action, growth=growth, wider=max(growth, float(np.sqrt(variance))), pair=pair)
+            before, after = data.pair_extended([table], settings.scatter_skies if draws else few)
+            known = context.knows(table)  # then its scatter is in the covariance
+            if not known:
+                noise = [effect.noise(site) for site in sites if candidate.channel in (None, site.channel)]
+                growth = max([1.0, *(float(np.mean(own)) for own in noise if own is not None)])
+            response, scatter = (after - before).mean(axis=0), data.scatter(after - before) if draws else None
+            pair = None if draws or known else (before, after)
+        action = Action.of(response, t, theta, (1.0 + added) * covariance, scatter)
+        yield replace(action, growth=growth, wider=max(growth, float(np.sqrt(1.0 + added))), pair=pair)
