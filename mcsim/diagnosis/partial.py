@@ -8,7 +8,7 @@ import numpy as np
 from mcsim.datavector.bent import beyond
 from mcsim.datavector.candidate import Candidate, columns_of, coordinates_of, effects_at, lost, scatters_of
 from mcsim.datavector.settings import DiagnosisSettings
-from mcsim.diagnosis.context import DataSet, DiagnosisContext
+from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.selection import Selection
 from mcsim.stats.gaussian import Fit
 from mcsim.stats.scattered import with_drawn_scatter
@@ -37,18 +37,13 @@ class PartialSearch:
 
     data: DataSet
 
-    @property
-    def context(self) -> DiagnosisContext:
-        """Return the model, its simulations and templates."""
-        return self.data.context
-
     def run(self, t: Matrix, candidates: Sequence[Candidate]) -> PartialExplanation | None:
         """Add the most significant candidate beside those that are detected already, until none is significant.
 
         None if nothing is. Each is significant beside those before it, before and after it is simulated together with
         them at its amplitude; of two similar effects the one that is not there may be the first.
         """
-        null, settings = self.context.null, self.context.settings
+        null, settings = self.data.context.null, self.data.context.settings
         members: tuple[int, ...] = ()
         refused: set[int] = set()
         while len(members) < settings.partial_effects and len(refused) < settings.partial_refusals:
@@ -79,7 +74,7 @@ class PartialSearch:
         A candidate counts for what its nearest possible amplitude explains, and not at all if it, or with it a member,
         is impossible.
         """
-        known = self.context
+        known = self.data.context
         search = Selection(known.null, self.data.x, t, candidates, known.calibration, known.settings).search(members)
         row, less = np.array([members], dtype=np.int64), np.zeros(len(candidates))
         for new in np.flatnonzero(search.beside(row)[0] <= known.settings.partial_level):
@@ -94,25 +89,20 @@ class PartialSearch:
         Strong effects change their own responses and each other's. None if one can have no such amplitude, or the
         amplitudes diverge round by round.
         """
-        columns, settings = np.array(columns_of(candidates, members)), self.context.settings
-        fitted = self.context.null.fit(self.data.x, t[:, columns])
-        for _ in range(settings.joint_rounds):
-            response = None
-            with if_possible():
+        columns, null, settings = columns_of(candidates, members), self.data.context.null, self.data.context.settings
+        fitted = null.fit(self.data.x, t[:, columns])
+        with if_possible():
+            for _ in range(settings.joint_rounds):
                 effects = effects_at(candidates, members, fitted)
                 tables = [candidates[member].table(effect) for member, effect in zip(members, effects, strict=True)]
                 stochastic = any(effect.parametrization.stochastic for effect in effects)
                 skies = settings.scatter_skies if stochastic else settings.constrained_skies
                 response = self.data.respond(tables, skies).mean(axis=0)
-            if response is None:
-                return None
-            t = t.copy()
-            at = coordinates_of(candidates, members, effects)
-            t[:, columns] += beyond(self.context.null, t[:, columns], at, response)
-            before, fitted = fitted, self.context.null.fit(self.data.x, t[:, columns])
-            moved = before.amplitudes, fitted.amplitudes, fitted.covariance
-            if has_settled(settings, *moved, settings.settled_share):
-                return t
+                t = t.copy()
+                t[:, columns] += beyond(null, t[:, columns], coordinates_of(candidates, members, effects), response)
+                before, fitted = fitted.amplitudes, null.fit(self.data.x, t[:, columns])
+                if has_settled(settings, before, fitted.amplitudes, fitted.covariance, settings.settled_share):
+                    return t
         return None
 
 
