@@ -94,11 +94,6 @@ class Subsets:
         return np.array([names.index(name) for name in names])
 
     @cached_property
-    def _order(self) -> Rows:
-        """Return the rank of each candidate among those to which the data respond, the ones of few columns first."""
-        return np.argsort(np.argsort(self.groups.sizes, kind="stable"), kind="stable")
-
-    @cached_property
     def _free(self) -> Rows:
         """Return the candidates whose scatter is not known."""
         return np.flatnonzero([candidate.scatter is None for candidate in self.candidates])
@@ -131,7 +126,9 @@ class Subsets:
         kept = np.all(self.groups.sizes[rows] > 0, axis=1)
         for i, j in combinations(range(rows.shape[1]), 2):
             kept &= self._identity[rows[:, i]] != self._identity[rows[:, j]]
-        rows = np.take_along_axis(rows[kept], np.argsort(self._order[rows[kept]], axis=1), axis=1)
+        rows = rows[kept]
+        few_columns_first = np.lexsort((rows, self.groups.sizes[rows]), axis=1)
+        rows = np.take_along_axis(rows, few_columns_first, axis=1)
         pattern, which = np.unique(self.groups.sizes[rows], axis=0, return_inverse=True)
         for index, ranks in enumerate(pattern):
             if ranks.sum() < self.null.dimension:
