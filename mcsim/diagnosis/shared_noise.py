@@ -59,8 +59,10 @@ class CrossPowers:
 
     @cached_property
     def pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of maps, by number, whose noise can be correlated."""
-        return [pair for pair in combinations(range(len(self.analysis.model.parts)), 2) if _white(self.analysis, pair)]
+        """Return the pairs of maps, by number, that have white noise, before any preparation."""
+        maps = enumerate(self.analysis.model.survey.making.maps)
+        white = [number for number, one in maps if one.noise_uk is not None and one.drawn is None]
+        return list(combinations(white, 2))
 
     @cached_property
     def rows(self) -> Rows:
@@ -114,12 +116,6 @@ def shared_noise(
     better = both[np.argmin(both[:, 1], axis=0), :, np.arange(len(taken))][certain[taken]]
     told = tuple(powers.pairs[number] for number in np.flatnonzero(certain))
     return SharedNoise(told, better[:, 0], better[:, 1], whole.pvalue)
-
-
-def _white(analysis: Analysis, pair: tuple[int, int]) -> bool:
-    """Return True if both maps have white noise, before any preparation."""
-    maps = [analysis.model.survey.making.maps[number] for number in pair]
-    return all(one.noise_uk is not None and one.drawn is None for one in maps)
 
 
 def _responses_of_powers(
