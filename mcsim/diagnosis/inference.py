@@ -97,7 +97,7 @@ def inferred(data: DataSet) -> Inferred:
         )
         if why := unconfirmed(context, found, reduction is not None):
             refusals.append(why)
-            found, reduction = found.unexplained(), None
+            found = found.unexplained()
     # What the rest of the data contradicts is not detected in it; after an unknown gap it was looked for already.
     named = refined.attribution.if_named(context.settings)
     searched = instead or (refusals and named.explanations) or found.faint or refined.attribution.verdict == "unknown"
@@ -185,8 +185,9 @@ def _scattered(data: DataSet, candidates: Sequence[Candidate], members: Sequence
     """
     context, fit = data.context, first
     if scatters := scatters_of(candidates, members):
-        alone = [_alone(data, members, k, first) for k in members if candidates[k].scatter is not None]
-        return with_drawn_scatter(context.null, t, fit, scatters, alone)
+        parts = parts_of(context.candidates, members, first)
+        alone = [_alone(data, *part) for part in parts if candidates[part[0]].scatter is not None]
+        return with_drawn_scatter(context.null, t, first, scatters, alone)
     with if_possible():  # between what was fitted and what can be
         acting = tables_at(context.candidates, members, first)
         groups, unknown = data.in_same_skies(acting), [one for one in acting if not context.knows(one)]
@@ -203,18 +204,16 @@ def _scattered(data: DataSet, candidates: Sequence[Candidate], members: Sequence
     return fit
 
 
-def _alone(data: DataSet, members: Sequence[int], drawn: int, first: Fit) -> Matrix | None:
+def _alone(data: DataSet, member: int, theta: Vector, covariance: Matrix) -> Matrix | None:
     """Return deviations of data without a member of a fit, in the skies of its scatter; None if it draws a pattern."""
-    context = data.context
-    candidate = context.candidates[drawn]
-    (part,) = (own for own in parts_of(context.candidates, members, first) if own[0] == drawn)
+    candidate = data.context.candidates[member]
     if candidate.parametrization.stochastic:
         return None
     try:
-        table = candidate.table(candidate.detected(*part[1:]))
+        table = candidate.table(candidate.detected(theta, covariance))
     except InputError:
         return None
-    before, _ = data.pair_extended([table], context.settings.scatter_skies)
+    before, _ = data.pair_extended([table], data.context.settings.scatter_skies)
     return data.scatter(before[:, : len(data.x)])
 
 

@@ -11,7 +11,6 @@ from mcsim.datavector.candidate import Candidate, Part, columns_of, parts_of, sc
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.partial import PartialExplanation, PartialSearch, has_settled
 from mcsim.diagnosis.selection import Attribution, Explanation, Selection, attribute
-from mcsim.errors import InputError
 from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit
 from mcsim.stats.scattered import GROWS, Acting
@@ -303,11 +302,10 @@ class Refiner:
         candidate, settings = now.candidates[index], self.context.settings
         if has_settled(settings, now.asked.get(index), coordinates, covariance):
             return True
-        try:
+        with if_possible():
             at = candidate.parametrization.coordinates(candidate.detected(coordinates, covariance))
-        except InputError:
-            return False
-        return has_settled(settings, now.done.get(index), at, covariance)
+            return has_settled(settings, now.done.get(index), at, covariance)
+        return False
 
     def _displaced(self, now: _Responses, first: Attribution, found: Attribution) -> list[int]:
         """Return candidates that explain less alone than by their first templates, and were simulated elsewhere.
