@@ -1,7 +1,7 @@
 """What all data sets of a model are tested with, and what a data set has to offer to be diagnosed."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Generic, TypeVar
@@ -104,6 +104,16 @@ def context(analysis: Analysis, ensemble: NullEnsemble, bank: TemplateBank) -> D
     return DiagnosisContext(analysis, ensemble, bank, null, candidates, calibration, scatter, templates, groups)
 
 
+def over_steps(
+    candidates: Sequence[Candidate], change: Callable[[config.Effect], Matrix]
+) -> Iterator[tuple[Candidate, Matrix]]:
+    """Yield those that can be simulated with the mean change by each small effect over its coordinate, (p + E, K)."""
+    for one in candidates:
+        with if_possible():
+            changes = [change(one.table(effect)).mean(axis=0) for effect in one.basis]
+            yield one, np.stack(changes, axis=1) / one.steps
+
+
 @dataclass(frozen=True, eq=False)
 class DataSet(ABC, Generic[Data]):
     """Offer data to a diagnosis: observed maps, or measured spectra."""
@@ -175,11 +185,7 @@ class DataSet(ABC, Generic[Data]):
 
     def responses(self, candidates: Sequence[Candidate], skies: int) -> Iterator[tuple[Candidate, Matrix]]:
         """Yield those that can be simulated with their responses to small effects over coordinates, (p + E, K)."""
-        for one in candidates:
-            with if_possible():
-                tables = [one.table(effect) for effect in one.basis]
-                changes = [self.respond_extended([table], skies).mean(axis=0) for table in tables]
-                yield one, np.stack(changes, axis=1) / one.steps
+        return over_steps(candidates, lambda table: self.respond_extended([table], skies))
 
     def scatter(self, changes: Matrix) -> Matrix:
         """Return deviations of changes by a stochastic effect, shape (draws, p), from their mean, (p, draws).

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain
 
 import healpy
 import numpy as np
@@ -15,7 +14,7 @@ from mcsim.datavector.localisation import Place, places
 from mcsim.datavector.map_checks import exchanges, share_left_out
 from mcsim.datavector.nuisances import half_given_other
 from mcsim.datavector.same_skies import SameSkies, Skies
-from mcsim.diagnosis.context import DataSet
+from mcsim.diagnosis.context import DataSet, over_steps
 from mcsim.diagnosis.output import DIGEST, digest
 from mcsim.diagnosis.shared_noise import shared_noise
 from mcsim.support.arrays import Map, Matrix, Vector
@@ -122,9 +121,9 @@ class ObservedMaps(DataSet[Sequence[Map]]):
     def templates(self) -> Matrix:
         """Return the templates; those that depend on the very sky are measured on the observed one if it departs.
 
-        Of a modulation this holds for what has the sign of the sky alone. In a part of the sky it is in part a gain,
-        and products of two maps of one sky respond as they fluctuate: behind a mask every sky looks like its own
-        modulation.
+        Of a modulation this holds for what of the response has the sign of the sky alone. In a part of the sky it is in
+        part a gain, and products of two maps of one sky respond as they fluctuate: behind a mask every sky looks like
+        its own modulation.
         """
         context, t, settings = self.context, self.context.templates.copy(), self.context.settings
         if self.gap.pvalue > settings.alpha:
@@ -132,25 +131,16 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         fixed = [c.random_response or c.nuisance or c.parametrization.mean_response for c in context.candidates]
         depends = ~np.array(fixed) & (context.sky_scatter >= settings.sky_scatter)
         own = [context.candidates[index] for index in np.flatnonzero(depends)]
-        patterns = [self.same_skies.is_pattern(one.table(one.basis[0])) for one in own]
-        others = [one for one, odd in zip(own, patterns, strict=True) if not odd]
-        for candidate, response in self.responses(others, settings.constrained_skies):
+        modulations = [one for one in own if self.same_skies.is_pattern(one.table(one.basis[0]))]
+        others, skies = [one for one in own if one not in modulations], settings.constrained_skies
+        for candidate, response in self.responses(others, skies):
             columns = list(candidate.columns)
             t[:, columns] = response[: len(t)] - context.bank.curvature[:, columns] * candidate.steps
-        modulations = [one for one, odd in zip(own, patterns, strict=True) if odd]
-        for candidate, response in self._odd_responses(modulations, settings.constrained_skies):
+        with if_possible():
+            self.same_skies.ahead([one.table(effect) for one in modulations for effect in one.basis], skies, odd=True)
+        for candidate, response in over_steps(modulations, lambda table: self.same_skies.odd([table], skies)):
             t[:, list(candidate.columns)] += response[: len(t)]
         return t
-
-    def _odd_responses(self, candidates: Sequence[Candidate], skies: int) -> Iterator[tuple[Candidate, Matrix]]:
-        """Yield candidates with what of their responses has the sign of the observed sky, shape (p + E, K)."""
-        tables = [[one.table(effect) for effect in one.basis] for one in candidates]
-        with if_possible():
-            self.same_skies.ahead([*chain(*tables)], skies, odd=True)
-        for one, each in zip(candidates, tables, strict=True):
-            with if_possible():
-                changes = [self.same_skies.odd([table], skies).mean(axis=0) for table in each]
-                yield one, np.stack(changes, axis=1) / one.steps
 
     @cached_property
     def exchanged(self) -> list[str]:
