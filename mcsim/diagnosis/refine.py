@@ -62,8 +62,8 @@ class _Responses:
 
     def copy(self) -> "_Responses":
         """Return another one to which nothing of what is simulated from now on is added."""
-        own = {**self.done}, {**self.asked}, {**self.last}
-        return _Responses(self.linear, self.t.copy(), [*self.candidates], *own)
+        done, asked, last = self.done.copy(), self.asked.copy(), self.last.copy()
+        return _Responses(self.linear, self.t.copy(), self.candidates.copy(), done, asked, last)
 
 
 @dataclass(frozen=True)
@@ -166,37 +166,31 @@ class Refiner:
         effects until it is simulated beside the others that act.
         """
         size = _size(found)
-        for members in self._nearly(now, size):
-            beside, together = self._in_place(now, members)
-            if 0 < _size(together) < size:
-                return beside, together
-        return now, found
+        smaller = (one for one in self._in_place(now, size) if 0 < _size(one[1]) < size)
+        return next(smaller, (now, found))
 
     def _with_sets(self, now: _Responses, found: Attribution, first: _Responses) -> tuple[_Responses, Attribution]:
         """Return responses and attribution with a set that suffices once it is simulated from the ``first`` responses.
 
         Two effects that bend may each explain less alone than others, which are simulated in their place.
         """
-        for members in self._nearly(first, TOGETHER + 1):
-            beside, together = self._in_place(first, members)
-            if together.explanations:
-                return beside, together
-        return now, found
+        sufficient = (one for one in self._in_place(first, TOGETHER + 1) if one[1].explanations)
+        return next(sufficient, (now, found))
 
-    def _in_place(self, now: _Responses, members: tuple[int, ...]) -> tuple[_Responses, Attribution]:
-        """Return responses with the members of a set simulated at their amplitudes, and the attribution by them."""
-        beside = now.copy()
-        for index in members:
-            self._simulate_in_place(beside, tuple(one for one in members if one != index), index)
-        return beside, self._completed(beside, self._attribute(beside))
+    def _in_place(self, now: _Responses, size: int) -> Iterator[tuple[_Responses, Attribution]]:
+        """Yield responses with the members of a set simulated at their amplitudes, and the attribution by them.
 
-    def _nearly(self, now: _Responses, size: int) -> Iterator[tuple[int, ...]]:
-        """Yield sets of several members, fewer than a size, that explain nearly as much as the best of as many."""
+        The sets have several members, fewer than a size, and explain nearly as much as the best of as many.
+        """
         chosen = self._selection(now)
         for fewer in range(2, size):
             ranked = chosen.most_probable(fewer, 2 * self.context.settings.tried)
             most = max((fit.delta_chi2 for _, fit in ranked), default=0.0)
-            yield from (members for members, fit in ranked if fit.delta_chi2 >= NEARLY * most)
+            for members in [members for members, fit in ranked if fit.delta_chi2 >= NEARLY * most]:
+                beside = now.copy()
+                for index in members:
+                    self._simulate_in_place(beside, tuple(one for one in members if one != index), index)
+                yield beside, self._completed(beside, self._attribute(beside))
 
     def _alike(self, now: _Responses, one: Explanation) -> list[tuple[tuple[int, ...], int]]:
         """Return candidates that were not simulated and are like a member of a set, behind the other members.
