@@ -184,9 +184,8 @@ class Slices:
         for place, (candidate, action) in enumerate(zip(candidates, actions, strict=True)):
             others = [other.response for k, other in enumerate(actions) if k != place]
             beside = np.column_stack([free, *others])
-            every = self._divisions(candidate, action.response)
-            divisions = (self._compared(one, action, beside) for one in every)
-            own = [one for one in divisions if one is not None]
+            divisions = self._divisions(candidate, action.response)
+            own = [one for part in divisions if (one := self._compared(part, action, beside)) is not None]
             if len(candidates) == 1 and not noisy:
                 own += self._of_maps(candidate.channel, action)
             comparisons.append(tuple(own))

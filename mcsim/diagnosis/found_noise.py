@@ -90,11 +90,12 @@ def _noise(data: DataSet, refined: Refined) -> dict[int, config.Effect]:
         fit = together(members)
         noise = [index for index, one in enumerate(candidates) if one.parametrization.noise_alone]
         if noise and not set(noise) & set(members):
-            beside, index = min(((together((*members, index)), index) for index in noise), key=lambda one: one[0].chi2)
-            taken, columns = fit.chi2 - beside.chi2, len(candidates[index].columns)
+            beside = {(*members, index): together((*members, index)) for index in noise}
+            best = min(beside, key=lambda every: beside[every].chi2)
+            taken, columns = fit.chi2 - beside[best].chi2, len(candidates[best[-1]].columns)
             pvalue = null.nested_test(taken, fit.chi2, columns, len(fit.amplitudes))
             if data.context.calibration.global_pvalue(pvalue) <= data.context.settings.further_level:
-                members, fit = (*members, index), beside
+                members, fit = best, beside[best]
     return {
         member: candidates[member].table(candidates[member].detected(theta, covariance))
         for member, theta, covariance in parts_of(candidates, members, fit)
