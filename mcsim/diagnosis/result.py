@@ -199,16 +199,17 @@ class DiagnosisResult:
         """Return ``verdict.json`` of schema 1."""
         near = self.candidates[self.nearest]
         sets = [[_effect_json(effect) for effect in one.effects] for one in self.sets]
-        return {
+        found = {
             "schema": 1,
             "case": self.case,
             "gap": {"p_value": self.test.pvalue, "statistic": self.test.chi2, "dof": self.test.dimension},
             "verdict": self.kind,
-            **({"faint": True, "probability": self.probability} if self.faint else {}),
+            "faint": self.faint or None,
+            "probability": self.probability if self.faint else None,
             "effects": sets[0] if sets else [],
             "alternatives": sets[1:],
-            "maps": [] if not self.sets else [asdict(one) for one in self.sets[0].maps],
-            **({"contradicted": [_set_json(one) for one in self.contradicted]} if self.contradicted else {}),
+            "maps": [asdict(own) for one in self.sets[:1] for own in one.maps],
+            "contradicted": [_set_json(one) for one in self.contradicted] or None,
             "odds": [one.odds for one in self.sets],
             "where": [_place_json(place) for place in self.places[:PLACES]],
             "shrink": None if self.held_out is None else self.held_out.to_json(),
@@ -223,15 +224,16 @@ class DiagnosisResult:
                 if one.detectable is not None
             ],
             "notes": [*self.orders, *self.notes],
-            **({} if self.unlisted is None else {"unlisted": [one.to_json() for one in self.unlisted]}),
-            **({} if self.unlisted_held_out is None else {"unlisted_shrink": self.unlisted_held_out.to_json()}),
-            **({"untested": list(self.untested)} if self.untested else {}),
-            **({"nuisances": [_plain(one) for one in self.nuisances]} if self.nuisances else {}),
-            **({"warnings": list(self.warnings)} if self.warnings else {}),
-            **({"worth": self.provenance["worth"]} if "worth" in self.provenance else {}),
-            **({"controls": self.controls.to_json()} if self.controls is not None else {}),
-            **({"simulator": asdict(self.agreement)} if self.agreement else {}),
+            "unlisted": None if self.unlisted is None else [one.to_json() for one in self.unlisted],
+            "unlisted_shrink": None if self.unlisted_held_out is None else self.unlisted_held_out.to_json(),
+            "untested": list(self.untested) or None,
+            "nuisances": [_plain(one) for one in self.nuisances] or None,
+            "warnings": list(self.warnings) or None,
+            "worth": self.provenance.get("worth"),
+            "controls": None if self.controls is None else self.controls.to_json(),
+            "simulator": None if self.agreement is None else asdict(self.agreement),
         }
+        return {key: value for key, value in found.items() if value is not None or key in ("shrink", "left")}
 
     def to_dataset(self) -> xr.Dataset:
         """Return the numbers as a dataset over the elements, candidates and maps.
