@@ -174,8 +174,8 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         """Return a sentence on noise that maps have in common, if the model fits with it."""
         known = self.context.of_model
         level = known.settings.residual_level
-        found = shared_noise(known.cross_powers, known.null, level, self.x, self._measured[1])
-        return [] if found is None else [found.sentence([part.name for part in self.context.analysis.model.parts])]
+        sentence = shared_noise(known.cross_powers, known.null, level, self.x, self._measured[1])
+        return [] if sentence is None else [sentence]
 
     @property
     def folds(self) -> tuple[str, str]:

@@ -8,7 +8,7 @@ make by their products. This response is simulated without a sky: the mean over 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations, combinations_with_replacement, product
+from itertools import combinations, combinations_with_replacement, compress, product
 
 import healpy
 import numpy as np
@@ -26,25 +26,6 @@ LEVEL = 1e-4  #: p-value up to which the noise of two maps, of all pairs, is cor
 NEARLY = 3.0  #: standard deviations of some power of residuals from which on correlations are fitted
 FAINT = 2.0  #: standard errors of a correlation up to which it is taken for none
 DRAWS = 2  #: least number of draws of noise over which a response is averaged
-
-
-@dataclass(frozen=True)
-class SharedNoise:
-    """Describe the pairs of maps, by their numbers, whose noise is correlated, and how well that fits the data."""
-
-    pairs: tuple[tuple[int, int], ...]
-    correlations: Vector  # of each pair
-    errors: Vector
-    pvalue: float  # of what is left of the data vector
-
-    def sentence(self, names: Sequence[str]) -> str:
-        """Return what is found in maps of these names."""
-        each = zip(self.pairs, self.correlations, self.errors, strict=True)
-        found = [f"{names[a]} and {names[b]} (correlation {measured(float(r), float(s))})" for (a, b), r, s in each]
-        return (
-            f"The model fits ({p_equals(self.pvalue)}) with noise in common, or a signal as white as noise: "
-            f"{', '.join(found)}."
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +71,8 @@ class CrossPowers:
 
 def shared_noise(
     powers: CrossPowers, null: SimulatedGaussian, level: float, x: Vector, bipolar_scan: Vector
-) -> SharedNoise | None:
-    """Return the noise in common that explains data vector and cross powers of residuals; None if none does.
+) -> str | None:
+    """Return a sentence on noise in common that explains data vector and cross powers of residuals; None if none does.
 
     Correlations of all pairs of maps are fitted to the powers together. What of them is FAINT is left out of the fit to
     the data vector, of the distribution ``null``. Fits have a p-value above ``level``.
@@ -114,8 +95,13 @@ def shared_noise(
         return None
     both = np.array([[fit.amplitudes[taken], fit.errors[taken]], [whole.amplitudes, whole.errors]])
     better = both[np.argmin(both[:, 1], axis=0), :, np.arange(len(taken))][certain[taken]]
-    told = tuple(powers.pairs[number] for number in np.flatnonzero(certain))
-    return SharedNoise(told, better[:, 0], better[:, 1], whole.pvalue)
+    names = [part.name for part in powers.analysis.model.parts]
+    found = [
+        f"{names[a]} and {names[b]} (correlation {measured(float(r), float(sigma))})"
+        for (a, b), (r, sigma) in zip(compress(powers.pairs, certain), better, strict=True)
+    ]
+    fits = f"The model fits ({p_equals(whole.pvalue)}) with noise in common, or a signal as white as noise"
+    return f"{fits}: {', '.join(found)}."
 
 
 def _responses_of_powers(
