@@ -42,10 +42,11 @@ def as_seen(context: DiagnosisContext, members: Sequence[int], found: Fit) -> It
         with_it, without = (survey(run, library=dict(analysis.library)) for run in runs)
         changes = (simulate.maps(with_it, number) - simulate.maps(without, number) for number in range(PATTERNS))
         rms = np.sqrt([[np.mean(own[pixels] ** 2) for own, pixels in zip(one, seen, strict=True)] for one in changes])
-        first = {model.channels[part.channel]: place for place, part in reversed([*enumerate(model.parts)])}
+        channels = [model.channels[part.channel] for part in model.parts]
+        first = {channel: channels.index(channel) for channel in channels}
         each = [
             f"{measured(float(rms[:, place].mean()), float(rms[:, place].std(ddof=1)), ' µK')} in {channel}"
-            for channel, place in sorted(first.items(), key=lambda item: item[1])
+            for channel, place in first.items()
             if rms[:, place].any()
         ]
         yield (

@@ -87,7 +87,7 @@ def reduction_of(data: ObservedMaps, made: Reconstruction, chosen: Sequence[int]
     folds = [view.split % 2 for view in made.scene.views]
     first, known = list[Plugin](), list[tuple[Structure, Matrix] | None]()
     for structure, effect in acting:
-        known.append(None)
+        shape = None
         by_map = structure.views and not structure.by_coordinate and structure.stage != "noise"
         if by_map and len(made.scene.splits) > 1:
             if not len((half := structure.within(0, folds)).weights):
@@ -97,8 +97,9 @@ def reduction_of(data: ObservedMaps, made: Reconstruction, chosen: Sequence[int]
             if structure.frame == "sky" and structure.size > 1:  # coefficients of one pattern, which are of one size
                 theta, covariance = shrunk(theta, covariance)
             if (own_effect := plugin(effect.name, structure, theta, made.scene)) is not None:
-                effect, known[-1] = own_effect, (structure, covariance) if structure.size > 1 else None
+                effect, shape = own_effect, (structure, covariance) if structure.size > 1 else None
         first.append(effect)
+        known.append(shape)
     t = np.stack([made.simulated([one], tested=True).x - made.before.x for one in first], axis=1)
     if (apart := data.in_halves(t.sum(axis=1))) is None:
         return None
