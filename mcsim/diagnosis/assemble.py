@@ -245,6 +245,5 @@ def _in_words(candidate: Candidate, size: float | None, at: str) -> str:
     """Return an amplitude as people read it, ``at`` parameters, and that the effect cannot have it where this is so."""
     if size is None or not np.isfinite(size):
         return "–"
-    return (
-        candidate.effect.format_amplitude(size) + at + (", more than is possible" if size > candidate.largest else "")
-    )
+    beyond = ", more than is possible" if size > candidate.largest else ""
+    return f"{candidate.effect.format_amplitude(size)}{at}{beyond}"

@@ -264,9 +264,7 @@ class Slices:
         found = null.fit(x, np.column_stack([beside, parts[best], sum(parts) - parts[best]]))
         variance = (wider * found.errors[-1]) ** 2 + action.error**2 + self.settings.consistency_error**2
         odds = float(np.exp(min((0.5 - found.amplitudes[-1]) / variance, 100.0)))
-        return Comparison(
-            division.kind, division.words, tuple(map(float, amplitudes)), tuple(map(float, errors)), p, odds
-        )
+        return Comparison(division.kind, division.words, tuple(amplitudes.tolist()), tuple(errors.tolist()), p, odds)
 
     def _wider(self, null: SimulatedGaussian, t: Matrix, fit: Fit, action: Action, rows: Rows, own: slice) -> float:
         """Return by how much errors of amplitudes grow with the effect in the data, at least as they do in all data.

@@ -260,12 +260,8 @@ def reduction_of(data: DataSet, refined: Refined) -> HeldOut | None:
         words += ": of what these have in common, alternate degrees and pixels"
     t, scatters = matrix @ t, [matrix @ one for one in scatters]
     parts = parts_of(context.candidates, members, best)
-    free = block_diag(
-        *(
-            theta[:, None] if context.candidates[member].parametrization.measured else np.eye(len(theta))
-            for member, theta, _ in parts
-        )
-    )
+    fitted = [(context.candidates[member].parametrization, theta) for member, theta, _ in parts]
+    free = block_diag(*(theta[:, None] if how.measured else np.eye(len(theta)) for how, theta in fitted))
 
     def acting_at(frozen: Fit) -> list[config.Effect]:
         if free.shape[1] < len(free):
@@ -283,8 +279,7 @@ def reduction_of(data: DataSet, refined: Refined) -> HeldOut | None:
 
     def skies(frozen: Fit) -> tuple[Matrix, Matrix] | None:
         acting = acting_at(frozen)
-        noisier = any(context.candidates[member].parametrization.noise_alone for member in members)
-        noisier = noisier and not any(map(context.knows, acting))
+        noisier = any(how.noise_alone for how, _ in fitted) and not any(map(context.knows, acting))
         pair = data.pair(acting) if noisier and not scatters else None
         return None if pair is None else (pair[0] @ matrix.T, pair[1] @ matrix.T)
 

@@ -383,13 +383,12 @@ class Refiner:
         for index in ranked:
             single, candidate = found.singles[index], candidates[index]
             pvalue = float(self.context.calibration.global_pvalue(single.nested_pvalue))
-            detected = candidate.parametrization.stochastic and (
-                not found.explanations or pvalue <= self.context.settings.stochastic_level
-            )
+            draws = candidate.parametrization.stochastic
+            detected = draws and (not found.explanations or pvalue <= self.context.settings.stochastic_level)
             detected = detected and (not alone or self._may_suffice(candidate, single))
             if index in best or (detected and candidate.identity not in stochastic):
                 work.setdefault(index, singles[index])
-                if candidate.parametrization.stochastic:
+                if draws:
                     stochastic.add(candidate.identity)
         return list(work.values())
 
