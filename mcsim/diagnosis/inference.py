@@ -23,7 +23,7 @@ from mcsim.diagnosis.rivals import with_rivals
 from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.diagnosis.words import refuted
 from mcsim.errors import InputError
-from mcsim.stats.excess import HeldOut
+from mcsim.stats.excess import HeldOut, excess
 from mcsim.stats.gaussian import Fit
 from mcsim.stats.scattered import GROWS, with_drawn_scatter, with_scatter, with_tangents
 from mcsim.support.arrays import Matrix, Vector
@@ -136,9 +136,9 @@ def _has_noise(refined: Refined, found: Attribution) -> bool:
 
 def _is_no_effect(data: DataSet, first: Refined) -> bool:
     """Return True if maps in another order, or with noise in common, fit the model, and no effect explains much."""
-    gap = first.attribution.gap
+    null = data.context.null
     most = max((fit.delta_chi2 for fit in first.attribution.singles), default=0.0)
-    return most < EXPLAINED * (gap.chi2 - gap.dimension) and bool(data.instead)
+    return null.hartlap_factor * most < EXPLAINED * excess(null, data.x).value and bool(data.instead)
 
 
 def confirmed(

@@ -18,6 +18,7 @@ from mcsim.diagnosis.context import DataSet, over_steps
 from mcsim.diagnosis.output import DIGEST, digest
 from mcsim.diagnosis.shared_noise import shared_noise
 from mcsim.support.arrays import Map, Matrix, Vector
+from mcsim.support.numbers import p_equals
 from mcsim.systematics import if_possible
 
 
@@ -160,13 +161,13 @@ class ObservedMaps(DataSet[Sequence[Map]]):
             return float(null.residual_test(chi2)) if null.log_likelihood(chi2) > needed else 0.0
 
         if (p := pvalue([healpy.reorder(one, n2r=True) for one in self.data])) > level:
-            notes.append(f"The model fits (p = {p:.2g}) with maps read in the order NESTED; say so in their headers.")
+            notes.append(f"The model fits ({p_equals(p)}) with maps read in the order NESTED; say so in their headers.")
         for order in exchanges(parts):
             p = pvalue([self.data[i] for i in order])
             if p > level:
                 moved = [f"{parts[i].name} as {part.name}" for part, i in zip(parts, order, strict=True)]
                 pairs = ", ".join(words for k, words in enumerate(moved) if order[k] != k)
-                notes.append(f"The model fits (p = {p:.2g}) with maps exchanged: {pairs}.")
+                notes.append(f"The model fits ({p_equals(p)}) with maps exchanged: {pairs}.")
         return notes
 
     @cached_property

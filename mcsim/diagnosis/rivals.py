@@ -14,6 +14,7 @@ from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.naming import slices_of
 from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.selection import Attribution
+from mcsim.stats.excess import excess
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import acts_through, if_possible
@@ -82,7 +83,8 @@ def _alone(data: DataSet, rivals: Sequence[tuple[Candidate, Matrix]]) -> Iterato
 
     Products of what a strong gain or signal adds to maps grow with the square of its amplitude.
     """
-    context, gap, size = data.context, data.gap, len(data.x)
+    context, null, size = data.context, data.context.null, len(data.x)
+    least = MUCH * excess(null, data.x).value / null.hartlap_factor
     for index, (rival, response) in enumerate(rivals):
         (own,), t = numbered([rival]), response[:size]
         curvature = np.zeros_like(t)
@@ -92,9 +94,9 @@ def _alone(data: DataSet, rivals: Sequence[tuple[Candidate, Matrix]]) -> Iterato
                 changes = [data.respond_extended([one], context.settings.channel_skies).mean(axis=0) for one in pair]
                 curvature[:, column] = sum(changes)[:size] / (2.0 * step**2)
         # What was measured at a step ahead has the bent part of it.
-        t = bent_templates(context.null, data.x, t - curvature * rival.steps, curvature, [own])
-        fit = context.null.fit(data.x, t)
-        if fit.delta_chi2 >= MUCH * (gap.chi2 - gap.dimension) and np.isfinite(beyond([own], (0,), fit)):
+        t = bent_templates(null, data.x, t - curvature * rival.steps, curvature, [own])
+        fit = null.fit(data.x, t)
+        if fit.delta_chi2 >= least and np.isfinite(beyond([own], (0,), fit)):
             yield index, t
 
 

@@ -7,6 +7,7 @@ from mcsim.diagnosis.context import DataSet
 from mcsim.diagnosis.inference import Inferred, inferred
 from mcsim.diagnosis.refine import Refiner
 from mcsim.diagnosis.result import DiagnosisResult
+from mcsim.support.numbers import p_equals
 from mcsim.systematics import acts_through
 
 FEWER = 0.5  #: share of how far pixels stand out that is left beside an effect which may make them, at most
@@ -37,9 +38,9 @@ def diagnosed(data: DataSet, case: str) -> tuple[DataSet | None, DiagnosisResult
         remedy += "before they are left out; give the model a mask (map.mask)."
         return None, left.result(case, *bad.sentences, remedy)
     if left.refined.attribution.verdict == "none":
-        fits = f"{LOOK_SO}. Without these pixels the model fits (p = {rest.gap.pvalue:.2g})."
+        fits = f"{LOOK_SO}. Without these pixels the model fits ({p_equals(rest.gap.pvalue)})."
         return None, _unexplained(data).result(case, *bad.sentences, fits)
-    departs = f"{LOOK_SO}: {bad.left_out} of all that follows. Whole maps have p = {data.gap.pvalue:.2g}."
+    departs = f"{LOOK_SO}: {bad.left_out} of all that follows. Whole maps have {p_equals(data.gap.pvalue)}."
     return rest, left.result(case, *bad.sentences, departs)
 
 

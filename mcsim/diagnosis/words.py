@@ -184,12 +184,12 @@ def _removed(found: HeldOut, start: str, forecast: str = "") -> str:
 
 def refuted(found: HeldOut) -> str:
     """Return what effects that held-out data refute do to these."""
-    does = f"raises the excess χ² of the other half from {found.before.value:.3g} to {found.after.value:.3g}"
+    does = f"raises the excess χ² of the other half from {number(found.before.value)} to {number(found.after.value)}"
     if found.after.value < found.before.value:
         removed, forecast = 100.0 * found.achieved.value, 100.0 * found.predicted.value
         does = f"removes {removed:.0f} % of the excess χ² of the other half, where {forecast:.0f} % were predicted"
     if found.pvalue_after <= DISAGREES:
-        does += f"; what remains differs from the simulations, p = {number(found.pvalue_after)}"
+        does += f"; what remains differs from the simulations, {p_equals(found.pvalue_after)}"
     return f"simulated with its amplitude from one half, it {does}"
 
 
