@@ -55,10 +55,10 @@ def with_rivals(data: DataSet, refined: Refined, found: Attribution) -> tuple[Da
     for members in sets:
         null, z, t = _widest(data, refined, members)
         wide = replace(refined, templates=t)
-        own = [one for one in in_place(null, z, wide, members, known, settings, least) if one not in places]
+        own = list(in_place(null, z, wide, members, known, settings, least))
         # What one split has, another may have with the other sign: both are simulated before one is named.
         also = [(other, kept) for rival, kept in own for other in _in_other_splits(known, rival)]
-        places += list(dict.fromkeys([*own, *also]))
+        places = list(dict.fromkeys([*places, *own, *also]))
     if not places:
         return None
     chosen = list(dict.fromkeys(rival for rival, _ in places))
