@@ -11,6 +11,7 @@ from mcsim.errors import InputError
 from mcsim.sphere import healpix, map_files
 from mcsim.sphere.checks import check_complete
 from mcsim.sphere.rotation import rotation_matrix
+from mcsim.support.arrays import divided
 from mcsim.systematics.base import Bound, Effect, Map, Site, Wording
 from mcsim.systematics.parametrization import Parametrization, Vector
 
@@ -49,7 +50,8 @@ class NoiseAnisotropy(Effect):
     amplitude
         a.
     template
-        Path of a HEALPix map to be taken for t; its frame is what its header says, or that of the maps.
+        Path of a HEALPix map to be taken for t; its frame is what its header says, or that in which maps are made
+        (``map.frame``). Of a finer map the means over pixels are taken.
     """
 
     name = "noise_anisotropy"
@@ -70,7 +72,7 @@ class NoiseAnisotropy(Effect):
             return None
         centres = healpix.centres(site.nside)
         if self.template:
-            pattern = _of_file(self.template, site.frame, centres)
+            pattern = _of_file(self.template, site, centres)
         else:
             pattern = 3.0 * (rotation_matrix(site.frame, "ecliptic")[2] @ centres) ** 2 - 1.0
         factor = 1.0 + self.amplitude * pattern
@@ -109,12 +111,20 @@ class NoiseKnee(Effect):
         return (1.0 + self.amplitude) * f_knee_hz
 
 
-def _of_file(path: str, frame: str, centres: NDArray[np.float64]) -> Map:
-    """Return a template at these directions in ``frame``."""
+def _of_file(path: str, site: Site, centres: NDArray[np.float64]) -> Map:
+    """Return a template in the pixels of a site, whose ``centres`` are given: means over those of a finer one.
+
+    The variance of a pixel's mean is that of its samples, on average.
+    """
     values, found, _ = map_files.read_map(Path(path))
     check_complete(values, path)
-    seen = rotation_matrix(frame, found or frame) @ centres
-    return np.asarray(values[healpy.vec2pix(healpy.npix2nside(values.size), *seen)])
+    nside, turn = healpy.npix2nside(values.size), rotation_matrix(site.frame, found or site.frame)
+    nearest = values[healpy.vec2pix(nside, *(turn @ centres))]
+    if nside <= site.nside:
+        return np.asarray(nearest)
+    pixel, npix = healpy.vec2pix(site.nside, *(turn.T @ healpix.centres(nside))), centres.shape[1]
+    count = np.bincount(pixel, minlength=npix)
+    return np.where(count > 0, divided(np.bincount(pixel, values, npix), count), nearest)
 
 
 MOST_HITS = 1e6  #: of a sample on average: more are no glitches, and too many to count

@@ -315,6 +315,15 @@ def test_noise_after_a_template(site, tmp_path):
         kind(amplitude=-1.1, template=path).noise(site)
 
 
+def test_noise_of_a_pixel_has_the_mean_of_a_finer_template(site, tmp_path):
+    """It had the value at the centre, one of 64 for a template of eight times the nside."""
+    path = str(tmp_path / "fine.fits")
+    pattern = np.random.default_rng(8).uniform(-1.0, 1.0, 12 * (8 * NSIDE) ** 2)
+    healpy.write_map(path, pattern, dtype=np.float64)
+    factor = systematics.get("noise_anisotropy")(amplitude=0.5, template=path).noise(site)
+    np.testing.assert_allclose(factor, 1.0 + 0.5 * healpy.ud_grade(pattern, NSIDE), rtol=1e-12)
+
+
 def test_foregrounds_after_a_template(site, sky, tmp_path):
     template = healpix.synthesis(gaussian_alm(load("wmap7", 32), np.random.default_rng(4))[None], NSIDE, 32)[0]
     path = str(tmp_path / "template.fits")
