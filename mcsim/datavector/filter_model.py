@@ -18,6 +18,7 @@ from mcsim.simulation.preparation import Preparation, keeps_pixels, regressions,
 from mcsim.simulation.survey import Channel, Survey
 from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Alm, Cl, Map, Matrix, Vector, divided
+from mcsim.systematics import Effect
 
 FAINT = 0.1
 """Power of the sky over that of the noise at the last degree of the filters; what is above adds below 1 % to sigmas."""
@@ -184,6 +185,25 @@ class Model:
     def of(self, channel: int) -> tuple[int, ...]:
         """Return the indices of the channel's maps."""
         return tuple(i for i, part in enumerate(self.parts) if part.channel == channel)
+
+    def noise_factor(self, effect: Effect, channel: int) -> Map | None:
+        """Return the factor of the variance of noise that an effect makes in the maps' pixels, (npix,); None: one.
+
+        It acts on maps as they are made: in their own frame and pixels.
+        """
+        factor, steps = effect.noise(self.survey.making.channels[channel].site), self._steps(channel)
+        return factor if factor is None or steps is None else np.nan_to_num(steps.local(factor), nan=1.0)
+
+    def noise_change(self, acting: Sequence[Effect], channel: int) -> float:
+        """Return the mean variance of the noise in the pixels that a channel sees, over that without effects."""
+        factors = [own for effect in acting if (own := self.noise_factor(effect, channel)) is not None]
+        if not factors:
+            return 1.0
+        variance = np.sum([divided(1.0, self.parts[i].precision) for i in self.of(channel)], axis=0)
+        return float(np.dot(np.prod(factors, axis=0), variance) / variance.sum())
+
+    def _steps(self, channel: int) -> Preparation | None:
+        return self.survey.channels[channel].maps[0].preparation
 
 
 def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:

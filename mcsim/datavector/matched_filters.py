@@ -41,7 +41,7 @@ def matched_filter(model: Model, effect: Effect, channel: int | None) -> Matched
         return _beam_filter(model, effect, channel)
     if acts_through(effect, "signal"):
         return _signal_filter(model, effect, channel)
-    factor = effect.noise(owner.site)
+    factor = model.noise_factor(effect, channel)
     if factor is not None:
         change = np.asarray(factor) - 1.0
         return lambda filtered: float(np.dot(filtered.squares[channel], change))

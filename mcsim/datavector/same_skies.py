@@ -207,10 +207,9 @@ class SameSkies:
 
     def noise_of(self, found: Sequence[config.Effect]) -> Noise:
         """Return by how much effects change the variance of the noise of each channel; () if all is little."""
-        row = []
-        for channel in self.analysis.model.survey.channels if found else ():
-            each = [effect.noise(channel.site) for effect in self._acting(channel, found)]
-            row.append(float(np.prod([np.mean(one) for one in each if one is not None])))
+        model = self.analysis.model
+        channels = model.survey.channels if found else ()
+        row = [model.noise_change(self._acting(one, found), index) for index, one in enumerate(channels)]
         return tuple(row) if any(abs(one - 1.0) > NOISY for one in row) else ()
 
     def orders(self, found: Sequence[config.Effect]) -> Orders:

@@ -120,7 +120,7 @@ def _actions(data: DataSet, refined: Refined, one: Explanation) -> Iterator[Acti
     What is drawn, and a map-making that stops early, which leaves noise as well as sky, differ from sky to sky.
     """
     context, bank, settings = data.context, data.context.bank, data.context.settings
-    sites = [channel.site for channel in context.analysis.model.survey.channels]
+    model = context.analysis.model
     whole = np.concatenate([refined.templates, bank.slice_matrix]) if len(bank.slice_matrix) else refined.templates
     for member, theta, covariance in parts_of(context.candidates, one.members, one.fit):
         candidate, tried = context.candidates[member], refined.candidates[member]
@@ -135,8 +135,8 @@ def _actions(data: DataSet, refined: Refined, one: Explanation) -> Iterator[Acti
             before, after = data.pair_extended([table], settings.scatter_skies if draws else few)
             known = context.knows(table)  # then its scatter is in the covariance
             if not known:
-                noise = [effect.noise(site) for site in sites if candidate.channel in (None, site.channel)]
-                growth = max([1.0, *(float(np.mean(own)) for own in noise if own is not None)])
+                own = (i for i, name in enumerate(model.channels) if candidate.channel in (None, name))
+                growth = max([1.0, *(model.noise_change([effect], i) for i in own)])
             response, scatter = (after - before).mean(axis=0), data.scatter(after - before) if draws else None
             pair = None if draws or known else (before, after)
         action = Action.of(response, t, theta, (1.0 + added) * covariance, scatter)

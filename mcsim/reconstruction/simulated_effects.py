@@ -231,7 +231,7 @@ class Reconstruction:
             seen = part.precision > 0
             change = np.where(seen, one - before, np.nan)
             if structure.stage == "noise":  # the same numbers are drawn with another variance
-                factor = effect.kind()(amplitude=1.0).noise(model.survey.channels[part.channel].site)
+                factor = model.noise_factor(effect.kind()(amplitude=1.0), part.channel)
                 assert factor is not None
                 extra = np.where(seen, (factor - 1.0) / np.where(seen, part.precision, 1.0), np.nan)
                 change = np.sign(extra) * np.sqrt(np.abs(extra))

@@ -136,6 +136,12 @@ class Preparation:
             power = step.local(power) if correlated else step.noise(power)
         return np.sqrt(np.nan_to_num(self.noise_band(fine) * power))
 
+    def local(self, values: Map) -> Map:
+        """Return the means, in prepared pixels, of what belongs to the pixels of maps as they are made, NaN without."""
+        for step in self.steps:
+            values = step.local(values)
+        return values
+
     def regressions(self) -> list[tuple[NDArray[np.float64], Map]]:
         """Return what is fitted and subtracted, shape (K, npix), and with which weights, as prepared maps show it."""
         found: list[tuple[NDArray[np.float64], Map]] = []

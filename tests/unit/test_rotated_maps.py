@@ -2,15 +2,18 @@
 
 from dataclasses import replace
 from functools import lru_cache
+from types import SimpleNamespace
 
+import healpy
 import numpy as np
 import pytest
 
 from instruments import two_channels
-from mcsim import config
+from mcsim import config, systematics
 from mcsim.bipolar import power_spectrum
 from mcsim.datavector.analysis import analysis_of, simulated_maps
 from mcsim.datavector.campaign import constrained_jobs
+from mcsim.datavector.matched_filters import matched_filter
 from mcsim.datavector.same_skies import SameSkies
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.shared_sky import shared_sky
@@ -139,3 +142,17 @@ def test_a_modulation_of_turned_maps_is_undone_where_it_acted():
     found = skies._turned_back(rotate_alm(seen, LMAX, *FRAMES), skies.turned([table_of(kind(amplitude=1.0), None)]))
     apart = alm_.power(rotate_alm(found, LMAX, *FRAMES[::-1]) - sky, LMAX)[2:].sum()
     assert apart < 0.01 * alm_.power(seen - sky, LMAX)[2:].sum()
+
+
+def test_noise_after_a_template_without_a_frame_is_looked_for_where_it_is(tmp_path):
+    """Such a template is in the frame of maps as they are made; the filter read it as one of turned maps."""
+    path = str(tmp_path / "pattern.fits")
+    healpy.write_map(path, healpix.centres(16)[0], dtype=np.float64)
+    table = two_channels("turned", lmax=LMAX, nside=16) | {"preparation": [{"kind": "rotate", "frame": "galactic"}]}
+    effect = systematics.get("noise_anisotropy")(amplitude=0.1, template=path)
+    own = tuple(name for name in systematics.catalogue() if name != "noise_level")
+    model = analysis_of(config.load(table), without=own).model
+    there = (rotation_matrix(*FRAMES[::-1]) @ healpix.centres(16))[0]  # ecliptic x of galactic pixels
+    found = matched_filter(model, effect, 0)(SimpleNamespace(squares=[there]))
+    # A centre is up to 0.055 rad off, half a diagonal, and the pattern has a slope of 1 and a rms of 0.577.
+    np.testing.assert_allclose(found, 0.1 * there @ there, rtol=0.055 / 0.577)

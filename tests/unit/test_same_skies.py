@@ -1,6 +1,7 @@
 """What is simulated ahead is asked for once; observed skies are seen through the effect that is fitted."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,6 +18,7 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
+from mcsim.sphere import healpix
 
 
 def test_effects_are_asked_for_at_once_and_then_known(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,6 +268,21 @@ def test_a_beam_of_smoothed_maps_changes_as_before_they_were_smoothed(name: str)
         else (np.zeros((1, lmax + 1)),) * 2
     )
     np.testing.assert_allclose(after[:, : lmax + 1], before[:, : lmax + 1] * window, rtol=1e-6, atol=1e-9)
+
+
+def test_other_noise_is_counted_in_the_pixels_that_are_seen(tmp_path: Path) -> None:
+    """At the poles noise with a pattern of mean 1 over the sky is more; the filter did not know."""
+    path, z = str(tmp_path / "polar.fits"), healpix.centres(16)[2]
+    healpy.write_map(path, (z > 0.8).astype(float), dtype=np.float64)
+    table = two_channels("polar", lmax=20)
+    table["map"] |= {"mask": path}
+    others = [name for name in systematics.catalogue() if name != "noise_anisotropy"]
+    skies = SameSkies(analysis_of(config.load(table), without=others), list, ())
+    noise = [config.Effect(name="noise_anisotropy", channel="V1", parameters={"amplitude": 0.4})]
+    variance = sum(1.0 / np.maximum(part.moments.hits, 1.0) for part in skies.analysis.model.parts[:2])[z > 0.8]
+    expected = np.average(1.0 + 0.4 * (3.0 * z[z > 0.8] ** 2 - 1.0), weights=variance)
+    np.testing.assert_allclose(skies.noise_of(noise), (expected, 1.0), rtol=1e-4)
+    assert expected > 1.5
 
 
 def test_noise_alone_is_compared_in_all_skies_that_there_are_without_it() -> None:
