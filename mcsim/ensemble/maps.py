@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mcsim import config
 from mcsim.ensemble import plan
 from mcsim.errors import InputError
-from mcsim.simulation import sampled, simulate
+from mcsim.simulation import power, sampled, simulate
 from mcsim.simulation.channels import check_effects
 from mcsim.simulation.survey import survey
 from mcsim.sphere.checks import check_whole
@@ -112,7 +112,7 @@ def write_maps(
     if sample_by_sample:
         for channel in shared.channels:
             sampled.check(channel)
-    simulate.draw_sky(shared, wanted.start)  # finds bad sky files before a folder is made
+    power.check_not_empty(shared, simulate.draw_sky(shared, wanted.start))  # and finds bad sky files
     writable(whole if not alone else whole.absolute().parent)
     ascii_name = run.name.encode("ascii", "backslashreplace").decode()  # as FITS headers require
     with reporting("maps", float(len(missing)), "realizations", quiet) as report:

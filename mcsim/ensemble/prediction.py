@@ -126,6 +126,7 @@ def predict(
     check_whole(nthreads, "nthreads", 1)
     survey = survey_of(source, nthreads)
     power.check(survey)
+    power.check_not_empty(survey, survey.cl)
     L_moments = moments_needed(survey, exact, L_moments)
     beams = scanned_beams(survey, L_moments, nthreads)
 

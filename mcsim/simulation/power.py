@@ -131,6 +131,22 @@ def check(survey: Survey) -> None:
         raise InputError(str(found))
 
 
+def check_not_empty(survey: Survey, sky: NDArray | None) -> None:
+    """Raise InputError for a sky, a_lm or C_l, that is zero where maps have neither noise nor effects: so are they.
+
+    ``sky``: None where the run has no spectrum.
+    """
+    run = survey.config
+    noise = any(m.noise_uk is not None for m in survey.maps)
+    noise = noise or any(one.side_b is not None and one.side_b.sigma0_uk > 0.0 for one in survey.channels)
+    if sky is not None and not (np.any(sky) or noise or run.effects):
+        source = run.sky.spectrum or run.sky.alm or run.sky.map
+        raise InputError(
+            f"the sky of {source} is zero up to sky.lmax = {run.sky.lmax}, and no channel has noise, so that all maps "
+            "are zero; give the sky power, or the channels noise (noise.sigma0_uk)."
+        )
+
+
 def _window(run: config.RunConfig, spec: config.Channel, channel: Channel, lmax: int) -> NDArray[np.float64]:
     """Return B_l times pixel window and preparation of a channel, up to an lmax beyond the sky's."""
     circular = spec if isinstance(spec.beam, CIRCULAR) else replace(spec, beam=replace(spec.beam, m_max=0))

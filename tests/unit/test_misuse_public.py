@@ -244,6 +244,16 @@ def test_arguments_of_another_kind_are_named(wrong, named) -> None:
         wrong()
 
 
+@pytest.mark.parametrize("made", [mcsim.predict, mcsim.run, lambda given: write_maps(given, "maps", realizations=0)])
+def test_a_run_of_nothing_is_refused(made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was an ensemble of zeros, without a word; of noise alone, or of effects, it is one."""
+    monkeypatch.chdir(tmp_path)
+    dark = {"sky": {"spectrum": 0.0 * CL, "lmax": LMAX}, "ensemble": {"realizations": 1}, "compute": {"workers": 1}}
+    with refused("sky.lmax", LMAX, "noise.sigma0_uk"):
+        made(run(**dark))
+    made(run(**dark, channel=[CHANNEL | {"noise": {"sigma0_uk": 1.0}}]))
+
+
 def test_an_effect_without_amplitude_is_warned_of() -> None:
     with pytest.warns(UserWarning, match="calibration has no amplitude"):
         check_effects(mcsim.load_config(run(effect=[{"name": "calibration", "channel": "W"}])))

@@ -110,7 +110,8 @@ def run(
         if shared.filtering is not None:
             with reporting("normalisation of the filter", 1.0, "", quiet) as report:
                 shared.filtering.fisher(report)
-        simulate.draw_sky(shared, wanted.start)  # finds bad sky files before a store is made
+        # Bad sky files are found before a store is made.
+        power.check_not_empty(shared, simulate.draw_sky(shared, wanted.start))
         if stack.enter_context(locked(target)):
             repair.sweep(target)
         stack.enter_context(_written_down(journal, loaded, wanted))
