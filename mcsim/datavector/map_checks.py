@@ -16,9 +16,10 @@ from mcsim.ensemble.external_maps import in_uk, parts_of
 from mcsim.ensemble.maps import POINTING, file_names, first_realization
 from mcsim.errors import InputError
 from mcsim.simulation import simulate
+from mcsim.sphere import map_files
 from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.sphere.header import first_table, opened
-from mcsim.sphere.map_files import read_uk
+from mcsim.sphere.mask import kept_mask
 from mcsim.sphere.pixel_order import check_ring
 from mcsim.support.arrays import Map
 from mcsim.support.folders import user_path
@@ -172,6 +173,25 @@ def warn_of_no_noise(model: Model) -> None:
         )
 
 
+def warn_of_parts_of_pixels(model: Model) -> None:
+    """Warn of finer masks than the maps that hide a part of pixels, each of which a diagnosis uses as a whole."""
+    run, found = model.survey.config, set()
+    for channel, split in run.each_map:
+        if (mask := channel.mask or run.map.mask) is not None:
+            found.add(config.channel_path(mask, channel.name, split))
+    for path in sorted(found):
+        fine, _, _ = map_files.read_map(path, bad=0.0)
+        weight = kept_mask(path, model.nside, model.frame, run.map.mask_frame)
+        parts = int(np.sum((weight > 0.0) & (weight < 1.0)))
+        if fine.size > weight.size and parts and np.isin(fine, (0.0, 1.0)).all():
+            warnings.warn(
+                f"{path} has nside {healpy.npix2nside(fine.size)} and hides a part of {parts} pixels of the maps, of "
+                f"nside {model.nside}; a diagnosis uses these as a whole, with what the mask hides of them, which a "
+                "mask of the maps' nside that is 0 there leaves out.",
+                stacklevel=3,
+            )
+
+
 def check_splits_differ(model: Model) -> None:
     """Raise InputError for two maps of a channel that are simulated alike: nothing is measured by their difference.
 
@@ -217,7 +237,7 @@ def _read(run: config.RunConfig, folder: str | Path) -> dict[str, Map]:
             others = sorted(each.name for each in folder.iterdir() if each.is_file() and each.name not in known)
             beside = f" (the folder has {some(others, 3)})" if others else ""
             raise InputError(f"{path} does not exist; the model has a map {part.name}, {remedy}{beside}.")
-        found[str(path)] = read_uk(path, part.frame, part.frequency_ghz)
+        found[str(path)] = map_files.read_uk(path, part.frame, part.frequency_ghz)
         _check_size(run, found[str(path)], str(path))
     _warn_of_others(path.name for path in folder.glob("*.fits*") if path.name not in names.values())
     return found

@@ -25,6 +25,7 @@ from mcsim.datavector.map_checks import (
     given_maps,
     of_pixel_means,
     warn_of_no_noise,
+    warn_of_parts_of_pixels,
 )
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.seeds import Checked
@@ -253,6 +254,8 @@ def _analysed(
     power.check(analysis.model.survey)
     if given and source is None:
         warn_of_no_noise(analysis.model)
+    if table is None:
+        warn_of_parts_of_pixels(analysis.model)
     return run, analysis, table, given
 
 

@@ -1,5 +1,6 @@
 """Elements of the data vector whose answers to a change of the maps are known."""
 
+import warnings
 from dataclasses import replace
 
 import healpy
@@ -10,14 +11,14 @@ from instruments import two_channels
 from mcsim import config
 from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.filter_model import model_of
-from mcsim.datavector.map_checks import check_pixels, check_splits_differ, checked_map
+from mcsim.datavector.map_checks import check_pixels, check_splits_differ, checked_map, warn_of_parts_of_pixels
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element, bins, blocks_of, pair_classes, ranges_within
 from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.systematics import catalogue
-from refusals import refused
+from refusals import refused, unnamed
 
 EDGES = (2, 12, 23, 33, 44, 54, 65)
 
@@ -247,3 +248,23 @@ def test_splits_that_are_the_same_map_are_refused(noise) -> None:
     check_splits_differ(analysis_of(parallel(40, loud, {"depth_uk_arcmin": 1e-2})).model)
     quiet = two_channels("halves", sigma0_uk=0.0)  # whose halves have samples of their own
     check_splits_differ(analysis_of(config.load(quiet)).model)
+
+
+def test_masks_that_hide_a_part_of_pixels_are_told_of(tmp_path) -> None:
+    """Light of the Galaxy that a fine mask hides was diagnosed, in pixels at its edge, without a word."""
+
+    def of_mask(nside: int, weights: tuple[float, float]) -> list[str]:
+        z, path = healpy.pix2vec(nside, np.arange(12 * nside**2))[2], tmp_path / f"mask_{nside}.fits"
+        healpy.write_map(path, np.where(np.abs(z) > 0.21, *weights), dtype=np.float64, overwrite=True)
+        table = two_channels("hidden", lmax=16, period_s=997.0)
+        run = config.load(table | {"map": table["map"] | {"mask": str(path)}})
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            warn_of_parts_of_pixels(model_of(survey(run), DiagnosisSettings()))
+        return [str(one.message) for one in said]
+
+    z = healpy.pix2vec(64, np.arange(12 * 64**2))[2]
+    share = healpy.ud_grade((np.abs(z) > 0.21).astype(float), 16)
+    [sentence] = of_mask(64, (1.0, 0.0))
+    assert not unnamed(sentence, "mask_64.fits", 64, 16, int(np.sum((share > 0.0) & (share < 1.0))))
+    assert not of_mask(16, (1.0, 0.0)) + of_mask(8, (1.0, 0.0)) + of_mask(64, (1.0, 0.5))
