@@ -18,7 +18,7 @@ from mcsim.errors import InputError
 from mcsim.simulation import simulate
 from mcsim.sphere import map_files
 from mcsim.sphere.checks import UNSEEN_BELOW
-from mcsim.sphere.header import first_table, opened
+from mcsim.sphere.header import T_CMB_K, first_table, opened
 from mcsim.sphere.mask import kept_mask
 from mcsim.sphere.pixel_order import check_ring
 from mcsim.support.arrays import Map
@@ -27,6 +27,7 @@ from mcsim.support.numbers import some
 
 ZEROS = 3  #: times as many pixels as have any other value, as maps of few digits have, that may be exactly 0
 QUIET = 1e-3  #: noise of a pixel, uK, below which two maps of a channel may be the same but for round-off
+WHOLE = 0.9  #: mean of a map over the temperature of the CMB, from which on that is in it
 ALIKE = 1e-7  #: rms of their difference, over that of one of them, up to which they are
 
 
@@ -189,6 +190,18 @@ def warn_of_parts_of_pixels(model: Model) -> None:
                 f"nside {model.nside}; a diagnosis uses these as a whole, with what the mask hides of them, which a "
                 "mask of the maps' nside that is 0 there leaves out.",
                 stacklevel=3,
+            )
+
+
+def check_monopole(model: Model, given: Mapping[str, Map]) -> None:
+    """Raise InputError for maps, of :func:`given_maps`, of the whole temperature, with the monopole of the CMB."""
+    for part, (name, map_) in zip(model.parts, given.items(), strict=True):
+        seen = (part.precision > 0) & (map_ > UNSEEN_BELOW)
+        mean = float(np.mean(map_[seen])) if seen.any() else 0.0
+        if mean > WHOLE * 1e6 * T_CMB_K:
+            raise InputError(
+                f"{name} has a mean of {mean:.4g} uK, about that of the CMB itself ({1e6 * T_CMB_K:g} uK), which is in "
+                "no simulation; subtract it, and give the differences from it."
             )
 
 

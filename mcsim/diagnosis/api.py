@@ -19,6 +19,7 @@ from mcsim.datavector.campaign import asking, batch
 from mcsim.datavector.candidate import TemplateBank
 from mcsim.datavector.kept import Kept
 from mcsim.datavector.map_checks import (
+    check_monopole,
     check_pixels,
     check_splits_differ,
     checked_maps,
@@ -253,6 +254,7 @@ def _analysed(
         check_splits_differ(analysis.model)
     power.check(analysis.model.survey)
     if given and source is None:
+        check_monopole(analysis.model, given)
         warn_of_no_noise(analysis.model)
     if table is None:
         warn_of_parts_of_pixels(analysis.model)

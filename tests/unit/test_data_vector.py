@@ -11,7 +11,13 @@ from instruments import two_channels
 from mcsim import config
 from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.filter_model import model_of
-from mcsim.datavector.map_checks import check_pixels, check_splits_differ, checked_map, warn_of_parts_of_pixels
+from mcsim.datavector.map_checks import (
+    check_monopole,
+    check_pixels,
+    check_splits_differ,
+    checked_map,
+    warn_of_parts_of_pixels,
+)
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.summaries import Element, bins, blocks_of, pair_classes, ranges_within
 from mcsim.datavector.wiener_filter import wiener_filter
@@ -248,6 +254,17 @@ def test_splits_that_are_the_same_map_are_refused(noise) -> None:
     check_splits_differ(analysis_of(parallel(40, loud, {"depth_uk_arcmin": 1e-2})).model)
     quiet = two_channels("halves", sigma0_uk=0.0)  # whose halves have samples of their own
     check_splits_differ(analysis_of(config.load(quiet)).model)
+
+
+def test_maps_of_the_whole_temperature_are_refused(analysis) -> None:
+    """2.7255 K is beyond the bound of a monopole: verdicts were "unknown", with a noise level that is not there."""
+    npix = 12 * analysis.model.nside**2
+    given = {part.name: np.random.default_rng(2).normal(0.0, 80.0, npix) for part in analysis.model.parts}
+    check_monopole(analysis.model, {name: one + 1e6 for name, one in given.items()})
+    given["W1:half1"] += 2.7255e6
+    given["W1:half1"][:9] = healpy.UNSEEN
+    with refused("W1:half1", f"{np.mean(given['W1:half1'][9:]):.4g}", "2.7255e+06"):
+        check_monopole(analysis.model, given)
 
 
 def test_masks_that_hide_a_part_of_pixels_are_told_of(tmp_path) -> None:
