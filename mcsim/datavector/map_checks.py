@@ -7,6 +7,7 @@ from pathlib import Path
 
 import healpy
 import numpy as np
+from numpy.typing import NDArray
 
 from mcsim import config
 from mcsim.datavector.filter_model import Model, sky_variance
@@ -16,7 +17,7 @@ from mcsim.ensemble.external_maps import in_uk, parts_of
 from mcsim.ensemble.maps import POINTING, file_names, first_realization
 from mcsim.errors import InputError
 from mcsim.simulation import simulate
-from mcsim.sphere import map_files
+from mcsim.sphere import healpix, map_files
 from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.sphere.header import T_CMB_K, first_table, opened
 from mcsim.sphere.mask import kept_mask
@@ -27,7 +28,7 @@ from mcsim.support.numbers import some
 
 ZEROS = 3  #: times as many pixels as have any other value, as maps of few digits have, that may be exactly 0
 QUIET = 1e-3  #: noise of a pixel, uK, below which two maps of a channel may be the same but for round-off
-WHOLE = 0.9  #: mean of a map over the temperature of the CMB, from which on that is in it
+WHOLE = 0.9  #: mean or dipole of a map over that of the CMB, from which on that is in it
 ALIKE = 1e-7  #: rms of their difference, over that of one of them, up to which they are
 
 
@@ -193,16 +194,40 @@ def warn_of_parts_of_pixels(model: Model) -> None:
             )
 
 
-def check_monopole(model: Model, given: Mapping[str, Map]) -> None:
-    """Raise InputError for maps, of :func:`given_maps`, of the whole temperature, with the monopole of the CMB."""
+def check_subtracted(model: Model, given: Mapping[str, Map]) -> None:
+    """Raise InputError for maps, of :func:`given_maps`, with the monopole or the dipole of the CMB still in them."""
+    dipole = np.asarray(model.survey.channels[0].site.dipole_uk)
+    pattern = dipole @ healpix.centres(model.nside)
     for part, (name, map_) in zip(model.parts, given.items(), strict=True):
-        seen = (part.precision > 0) & (map_ > UNSEEN_BELOW)
-        mean = float(np.mean(map_[seen])) if seen.any() else 0.0
+        seen = (part.precision > 0) & (map_ > UNSEEN_BELOW) & np.isfinite(map_)
+        if not seen.any():
+            continue
+        mean = float(np.mean(map_[seen]))
         if mean > WHOLE * 1e6 * T_CMB_K:
             raise InputError(
                 f"{name} has a mean of {mean:.4g} uK, about that of the CMB itself ({1e6 * T_CMB_K:g} uK), which is in "
                 "no simulation; subtract it, and give the differences from it."
             )
+        share, error = _share_of(pattern, model, part, map_, seen)
+        if abs(share - 1.0) < 1.0 - WHOLE and error < (1.0 - WHOLE) / 2.0:
+            raise InputError(
+                f"{name} has {share:.3g} times the dipole of the CMB, {np.linalg.norm(dipole):g} uK, in it, which is "
+                "subtracted from simulations; subtract it (a [[preparation]] subtract_dipole does so to both)."
+            )
+
+
+def _share_of(pattern: Map, model: Model, part: Part, map_: Map, seen: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return how many times a pattern is in the seen pixels of a map, and an error that is rather too large.
+
+    The sky has few modes that look like a dipole, and counts as one; noise is of single pixels.
+    """
+    t = pattern[seen] - np.mean(pattern[seen])
+    square = float(t @ t)
+    if square == 0.0:
+        return 0.0, np.inf
+    sky = sky_variance(model.cl, model.response[part.channel]) * t.size / square
+    noise = float(np.sum(t**2 / part.precision[seen])) / square**2
+    return float(t @ map_[seen]) / square, float(np.sqrt(sky + noise))
 
 
 def check_splits_differ(model: Model) -> None:

@@ -19,9 +19,9 @@ from mcsim.datavector.campaign import asking, batch
 from mcsim.datavector.candidate import TemplateBank
 from mcsim.datavector.kept import Kept
 from mcsim.datavector.map_checks import (
-    check_monopole,
     check_pixels,
     check_splits_differ,
+    check_subtracted,
     checked_maps,
     given_maps,
     of_pixel_means,
@@ -254,7 +254,7 @@ def _analysed(
         check_splits_differ(analysis.model)
     power.check(analysis.model.survey)
     if given and source is None:
-        check_monopole(analysis.model, given)
+        check_subtracted(analysis.model, given)
         warn_of_no_noise(analysis.model)
     if table is None:
         warn_of_parts_of_pixels(analysis.model)

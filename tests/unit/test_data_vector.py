@@ -12,9 +12,9 @@ from mcsim import config
 from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.filter_model import model_of
 from mcsim.datavector.map_checks import (
-    check_monopole,
     check_pixels,
     check_splits_differ,
+    check_subtracted,
     checked_map,
     warn_of_parts_of_pixels,
 )
@@ -260,11 +260,22 @@ def test_maps_of_the_whole_temperature_are_refused(analysis) -> None:
     """2.7255 K is beyond the bound of a monopole: verdicts were "unknown", with a noise level that is not there."""
     npix = 12 * analysis.model.nside**2
     given = {part.name: np.random.default_rng(2).normal(0.0, 80.0, npix) for part in analysis.model.parts}
-    check_monopole(analysis.model, {name: one + 1e6 for name, one in given.items()})
+    check_subtracted(analysis.model, {name: one + 1e6 for name, one in given.items()})
     given["W1:half1"] += 2.7255e6
     given["W1:half1"][:9] = healpy.UNSEEN
     with refused("W1:half1", f"{np.mean(given['W1:half1'][9:]):.4g}", "2.7255e+06"):
-        check_monopole(analysis.model, given)
+        check_subtracted(analysis.model, given)
+
+
+def test_maps_with_the_dipole_of_the_sky_are_refused(analysis) -> None:
+    """A noisy map had no odd rms with it, and a dipole of 3364 uK is beyond its bound: the verdict was "unknown"."""
+    model = analysis.model
+    dipole = model.survey.channels[0].site.dipole_uk @ healpy.pix2vec(model.nside, np.arange(12 * model.nside**2))
+    given = dict(zip([part.name for part in model.parts], simulate.maps(survey(analysis.run), 0), strict=True))
+    check_subtracted(model, {name: one + 0.1 * dipole for name, one in given.items()})
+    given["W1:half2"] = given["W1:half2"] + dipole
+    with refused("W1:half2", 3364.5, "subtract_dipole"):
+        check_subtracted(model, given)
 
 
 def test_masks_that_hide_a_part_of_pixels_are_told_of(tmp_path) -> None:
