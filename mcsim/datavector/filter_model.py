@@ -116,8 +116,8 @@ class Model:
 
     @cached_property
     def hides(self) -> bool:
-        """Return True if a map lacks a part of the sky that is more than little."""
-        return hidden_share(self.parts) >= self.settings.hidden_share
+        """Return True if a map lacks a part of the sky that is more than little, or hardly sees it."""
+        return hides(self.parts, self.settings)
 
     @cached_property
     def masks(self) -> tuple[Map, ...]:
@@ -257,7 +257,7 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     cl, snr = survey.cl[: lmax + 1], snr[: lmax + 1]
     response, colours = response[:, : lmax + 1], colours[:, : lmax + 1]
     known, inverse = pixels and not bright and bool(snr[lmax] <= SHARP), None
-    if known and hidden_share(parts) >= settings.hidden_share:
+    if known and hides(parts, settings):
         parts = list(marginalised(survey, parts))
         inverse = inverse_of(cl, response, parts)
     maps = survey.nside, cl, response, tuple(parts), dipole_alm(survey.channels[0].site.dipole_uk, lmax)
@@ -277,9 +277,18 @@ def _colour(preparation: Preparation, fine: int, floor: float, size: int) -> Cl:
     return np.asarray(floor * area + (1.0 - floor * area) * window)
 
 
-def hidden_share(parts: Sequence[Part]) -> float:
-    """Return the share of the sky that the map which lacks most of it does not show."""
-    return max(float(np.mean(part.precision == 0.0)) for part in parts)
+def hides(parts: Sequence[Part], settings: DiagnosisSettings) -> bool:
+    """Return True if maps lack so much of the sky, or have so uneven noise, that an isotropic filter wastes it.
+
+    That filter takes the noise for the mean variance everywhere; what maps tell of the largest scales follows the mean
+    of the inverse.
+    """
+    for part in parts:
+        seen = part.precision[part.precision > 0.0]
+        uneven = float(np.mean(1.0 / seen) * np.mean(seen))
+        if 1.0 - seen.size / part.precision.size >= settings.hidden_share or uneven > settings.uneven_noise:
+            return True
+    return False
 
 
 def _pooled(model: Model) -> Model:

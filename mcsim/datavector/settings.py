@@ -147,6 +147,9 @@ class DiagnosisSettings:
         Share of the sky that a map lacks, as behind a mask, from which on maps are filtered by their inverse
         covariance, and not isotropically. 0: always, which costs a quarter more for each simulation. Maps that show the
         sky beyond the filters have that of their mean in any case.
+    uneven_noise
+        Mean variance of the noise of a map's pixels times the mean of its inverse, 1 for even noise, above which maps
+        are filtered so on the full sky too.
     filter_tolerance, filter_iterations
         At which the conjugate gradients of that filter end for typical maps: what is left of the system, relative to
         what the filter leaves of the sky, and most iterations. Simulations and data go through the same ones, so that
@@ -259,6 +262,7 @@ class DiagnosisSettings:
     noise_floor: float = 1e-3
     hole_iterations: int = 30
     hidden_share: float = 0.01
+    uneven_noise: float = 3.0
     filter_tolerance: float = 1.0
     filter_iterations: int = 30
     sky_bins: int = 8
