@@ -129,7 +129,8 @@ class ChannelResult:
 
     def sentence(self) -> str:
         """Say what was found in this channel."""
-        more = f" {self.one_sided} pixels that one side alone observed are left out." if self.one_sided else ""
+        many = ("one pixel", "is") if self.one_sided == 1 else (f"{self.one_sided} pixels", "are")
+        more = " {} that one side alone observed {} left out.".format(*many) if self.one_sided else ""
         if self.spread_rms_uk:
             spread = number(self.spread_rms_uk)
             more += f" What single samples change in {self.described}, {spread} uK rms, is taken off first."

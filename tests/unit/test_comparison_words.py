@@ -63,6 +63,18 @@ def test_maps_without_any_difference_are_not_called_accurate_to_zero(rms, words)
     assert found.sentence() == f"W: identical {words}"
 
 
+@pytest.mark.parametrize(("number", "words"), [(1, "one pixel that"), (2, "2 pixels that")])
+def test_one_pixel_that_is_left_out_is_one(number, words) -> None:
+    """It was "1 pixels that one side alone observed are left out"."""
+    maps = np.zeros((1, 12))
+    found = ChannelResult(
+        *("W", ("W",), "identical", (), (), (), 0.0),
+        *(0.0, 100.0, 0.0, 0.0, 0.0, (), 0.0),
+        *(maps, maps, maps, maps == 0.0, number, None, ("W",)),
+    )
+    assert words in found.sentence()
+
+
 def test_names_with_the_signs_of_mathematics_are_drawn_as_they_are() -> None:
     """matplotlib failed on them, after all was computed: nothing was written."""
     one = DifferenceResult("one", "a$_$b", 1.0, "K", 1.0, {"at": "c$_$d"}, "")
