@@ -49,6 +49,7 @@ def main() -> None:
         if isinstance(stream, TextIOWrapper):  # of a terminal that may lack ± and µ
             stream.reconfigure(errors="replace")
     warnings.showwarning = _warned
+    _said.clear()
     try:
         app()
     except (InputError, RunError) as error:
@@ -66,12 +67,15 @@ def main() -> None:
 
 
 _of_python = warnings.showwarning
+_said: set[str] = set()
 
 
 def _warned(message: Any, category: Any, filename: str, lineno: int, file: Any = None, line: Any = None) -> None:
-    """Say a warning of mcsim's own in a sentence, and any other one as Python does."""
+    """Say a warning of mcsim's own once, in a sentence, and any other one as Python does."""
     if Path(filename).is_relative_to(Path(__file__).parents[1]):
-        print(f"mcsim: {message}", file=sys.stderr)
+        if str(message) not in _said:
+            print(f"mcsim: {message}", file=sys.stderr)
+        _said.add(str(message))
     else:
         _of_python(message, category, filename, lineno, file, line)
 

@@ -19,6 +19,7 @@ FLOOR_DB = 40.0
 _PIXELS = 361
 _CONTOURS = (0.1, 0.25, 0.5, 0.75, 0.9)
 _LARGEST_ORDER = 8
+_LONG_ARCMIN = 120.0  # from which on axes are in degrees
 _FLOOR = 1e-6  # of the coefficients drawn
 _ARCMIN = np.degrees(1.0) * 60
 # Negative blue, positive ochre, white at and below the floor: safe for colour-blind readers.
@@ -57,15 +58,16 @@ def _pattern(beam: Beam, beam_map: BeamMap | None, reach_arcmin: float) -> NDArr
     return values / values.max()
 
 
-def _square(axes: Axes, values: NDArray[np.float64], side: float, unit: str, **style: Any) -> AxesImage:
-    """Draw values on a square of +-side around the centre of the beam."""
+def _square(axes: Axes, values: NDArray[np.float64], reach_arcmin: float, **style: Any) -> AxesImage:
+    """Draw values on a square of +-reach around the centre of the beam."""
+    side, unit = (reach_arcmin / 60.0, "deg") if reach_arcmin > _LONG_ARCMIN else (reach_arcmin, "arcmin")
     axes.set(xlabel=f"x, in-scan  [{unit}]", ylabel=f"y, cross-scan  [{unit}]")
     return axes.imshow(values, origin="lower", extent=(-side, side, -side, side), **style)
 
 
 def _draw_peak(axes: Axes, beam: Beam, beam_map: BeamMap | None, summary: BeamSummary, reach: float) -> None:
     values = _pattern(beam, beam_map, reach)
-    image = _square(axes, values, reach, "arcmin", cmap="YlGnBu_r", vmin=0, vmax=1, interpolation="bilinear")
+    image = _square(axes, values, reach, cmap="YlGnBu_r", vmin=0, vmax=1, interpolation="bilinear")
     colours, widths = ["w", "w", "w", "k", "k"], [0.8, 0.8, 1.8, 0.8, 0.8]
     contours = axes.contour(values, _CONTOURS, extent=image.get_extent(), colors=colours, linewidths=widths)
     axes.clabel(contours, fmt=lambda level: f"{level:.0%}", fontsize=7)
@@ -76,11 +78,10 @@ def _draw_peak(axes: Axes, beam: Beam, beam_map: BeamMap | None, summary: BeamSu
 
 def _draw_faint(axes: Axes, beam: Beam, beam_map: BeamMap | None, reach: float) -> None:
     values = _pattern(beam, beam_map, reach)
-    unit, name = (60.0, "deg") if reach > 120 else (1.0, "arcmin")
     with np.errstate(divide="ignore"):
         above_floor = np.maximum(FLOOR_DB + 10 * np.log10(np.abs(values)), 0.0)
     style = {"cmap": _SIGNED, "vmin": -FLOOR_DB, "vmax": FLOOR_DB, "interpolation": "nearest"}
-    image = _square(axes, np.sign(values) * above_floor, reach / unit, name, **style)
+    image = _square(axes, np.sign(values) * above_floor, reach, **style)
     axes.set_title("Surroundings, with the sign of the response", fontsize=10)
     bar = axes.figure.colorbar(image, ax=axes, shrink=0.85, pad=0.02)
     ticks = np.arange(-FLOOR_DB, FLOOR_DB + 1, 10).tolist()

@@ -47,3 +47,30 @@ def test_scripts_need_no_guard(way: str, tmp_path: Path) -> None:
     if way == "script":
         assert unnamed(done.stdout, "concurrent.futures.ProcessPoolExecutor") == []
         assert not (tmp_path / "pool.zarr").exists()
+
+
+ALIASED = """
+schema = 1
+name = "aliased"
+sky = { spectrum = "wmap7", lmax = 20 }
+map = { nside = 8 }
+biposh = { summary_bin = 10 }
+ensemble = { realizations = 2 }
+
+[[channel]]
+name = "A"
+beam = { kind = "elliptical_gaussian", fwhm_major_arcmin = 700.0, fwhm_minor_arcmin = 600.0 }
+noise = { sigma0_uk = 10.0 }
+scan = { kind = "hit_averaged", model = "wmap", sample_period_s = 129.3 }
+"""
+
+
+@pytest.mark.parametrize("words", [["run"], ["limit", "--only", "calibration", "--probes", "4"]])
+def test_a_warning_is_said_once(words: list[str], tmp_path: Path) -> None:
+    """Workers make the survey that the command has made, and a limit makes a second one."""
+    (tmp_path / "aliased.toml").write_text(ALIASED)
+    command = [sys.executable, "-m", "mcsim", words[0], "aliased.toml", *words[1:]]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("every 129.3 s") == 1
+    assert "UserWarning" not in done.stderr

@@ -113,6 +113,18 @@ def test_text_warns_of_a_beam_cut_at_lmax() -> None:
     assert "B_l is still" in format_summary(summarize(Beam.gaussian(10, 500)))
 
 
+def test_a_beam_that_ends_early_has_rows_and_no_coefficients_beyond_its_degree() -> None:
+    rows = format_summary(summarize(Beam.elliptical(400, 300, lmax=10, mmax=4))).splitlines()[-2:]
+    assert [row.split()[0] for row in rows] == ["2", "10"]
+    assert [row.split().count("–") for row in rows] == [1, 0]
+
+
+@pytest.mark.parametrize(("width", "unit"), [(50.0, "arcmin"), (400.0, "deg")])
+def test_axes_of_a_wide_beam_are_in_degrees(width, unit) -> None:
+    figure = beam_figure(Beam.gaussian(width, 300))
+    assert unit in next(axes for axes in figure.axes if axes.get_title().startswith("Peak")).get_xlabel()
+
+
 @pytest.mark.parametrize("known_as", ["map", "blm", "circular"])
 def test_figure_has_its_panels(tmp_path, known_as) -> None:
     beam_map = drawn(30.0, 24.0, 20.0)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mcsim.instrument.beams.beam import Beam
 from mcsim.instrument.beams.beammap import BeamMap, solid_angle_values
 
-DEFAULT_ELLS = (50, 100, 200, 300, 500, 700, 1000, 1500, 2000, 3000)
+DEFAULT_ELLS = (2, 10, 20, 50, 100, 200, 300, 500, 700, 1000, 1500, 2000, 3000)
 BAND_LIMITED_WINDOW = 1e-5
 CIRCULAR_AXIS_RATIO = 1e-3
 PEDESTAL = 0.01  #: response about the edge of a map over its peak from which on it is told of
@@ -150,7 +150,7 @@ def format_summary(summary: BeamSummary) -> str:
         if abs(window[i]) < _LISTED_WINDOW and i > 1:
             lines.append(f"{ell:6d}  |B_l| is below {_LISTED_WINDOW:g} here and beyond")
             break
-        ratios = "".join(f"{table[m, i]:14.3e}" for m in orders)
+        ratios = "".join(f"{table[m, i]:14.3e}" if m <= ell else f"{'–':>14}" for m in orders)
         lines.append(f"{ell:6d} {window[i]:12.6f}{ratios}")
     return "\n".join(lines)
 
