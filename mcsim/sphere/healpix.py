@@ -248,7 +248,12 @@ def read_pixel_window(path: Path, lmax: int, nside: int | None = None) -> Cl:
     if nside is not None and found not in (None, nside):
         raise InputError(f"{path} holds the pixel window of nside {found}; give that of {nside}.")
     if window.size <= lmax:
-        raise InputError(f"{path} holds a pixel window up to l = {window.size - 1}, below the lmax {lmax} of the sky.")
+        raise InputError(
+            f"{path} holds a pixel window up to l = {window.size - 1}, below the lmax {lmax} of the sky; lower "
+            "sky.lmax or give a longer table."
+        )
+    if window[0] < 0.0:
+        raise InputError(f"{path} starts at {window[0]:g}, so its sign is reversed; multiply it by -1.")
     if not np.all(window[: lmax + 1] > 0.0):
         raise InputError(f"{path} holds a pixel window that is not positive up to l = {lmax}; give a HEALPix table.")
     if abs(window[0] - 1.0) > 0.01 or window[: lmax + 1].max() > 1.01:

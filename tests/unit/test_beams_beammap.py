@@ -359,6 +359,15 @@ def test_unusable_headers_are_refused(tmp_path) -> None:
             read_map(single, plane=2, pixel_deg=0.05)
 
 
+def test_steps_in_radians_without_a_unit_are_asked_about(tmp_path) -> None:
+    """Read as degrees they made a beam of 30' one of half an arcmin."""
+    step = np.radians(0.04)
+    with refused("steps.fits", f"{step:g}", "CUNIT1", "pixel_deg", 0.04):
+        read_map(write(tmp_path / "steps.fits", small_image(), pixel_deg=step))
+    assert read_map(write(tmp_path / "said.fits", small_image(), pixel_deg=step, CUNIT1="deg")).pixel_rad < 1e-4
+    assert read_map(tmp_path / "steps.fits", pixel_deg=0.04).pixel_rad == pytest.approx(step)
+
+
 def test_truncated_empty_and_foreign_files_are_refused(tmp_path) -> None:
     whole = write(tmp_path / "whole.fits", small_image()).read_bytes()
     (tmp_path / "truncated.fits").write_bytes(whole[:6000])

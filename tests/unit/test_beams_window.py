@@ -173,9 +173,10 @@ def test_beams_of_a_run_are_shown_as_far_as_their_files_reach(tmp_path):
 @pytest.mark.parametrize(
     ("values", "named"),
     [
-        (WINDOW[:30], (29, 40)),
+        (WINDOW[:30], (29, 40, "longer")),
         (WINDOW**0.5 * 1.5, (1.5,)),
         (0.9 * WINDOW, (0.9,)),
+        (-WINDOW, (-1, "sign")),
         (1.03 * WINDOW, (1.03,)),
         (np.append(WINDOW, np.nan), ()),
         (np.append(WINDOW, 2.0), (2.0,)),

@@ -97,8 +97,11 @@ def test_read_pixel_window(tmp_path) -> None:
     column = fits.Column("TEMPERATURE", "D", array=np.linspace(1, 0.5, 11))
     fits.BinTableHDU.from_columns([column]).writeto(path)
     np.testing.assert_allclose(healpix.read_pixel_window(path, 5), np.linspace(1, 0.5, 11)[:6])
-    with refused("window.fits", 10, "lmax", 20):
+    with refused("window.fits", 10, "lmax", 20, "longer"):
         healpix.read_pixel_window(path, 20)
+    np.save(tmp_path / "negative.npy", -np.linspace(1, 0.5, 11))
+    with refused("negative.npy", -1, "sign"):
+        healpix.read_pixel_window(tmp_path / "negative.npy", 5)
     with refused("missing.fits"):
         healpix.read_pixel_window(tmp_path / "missing.fits", 20)
     path.write_text("not FITS")

@@ -312,6 +312,29 @@ def test_constructors_check_their_input(make) -> None:
         make()
 
 
+def test_samples_that_are_none_are_said_to_be_none() -> None:
+    with refused("theta", "phi", "psi", "sample"):
+        Moments.from_pointing([], [], [], 8)
+
+
+def test_saved_beams_and_coefficients_of_another_kind_are_refused(tmp_path) -> None:
+    beam = Beam.elliptical(900.0, 600.0, lmax=LMAX, mmax=4)
+    beam.save(tmp_path / "beam.npz")
+    np.savez(tmp_path / "other.npz", blm=beam.blm)
+    polarised = np.zeros((3, alm_.size(LMAX)))
+    polarised[0, : LMAX + 1] = np.sqrt((2 * np.arange(LMAX + 1) + 1) / (4 * np.pi))
+    for make, named in (
+        (lambda: Beam.from_blm(tmp_path / "other.npz"), ("other.npz", "neglected_power", "Beam.save")),
+        (lambda: Beam.from_blm(tmp_path / "beam.npz", mmax=5), ("beam.npz", 4, 5)),
+        (lambda: Beam.from_blm(tmp_path / "beam.npz", LMAX + 1), ("beam.npz", LMAX, LMAX + 1)),
+        (lambda: Beam.from_blm(np.ones((4, 3))), ((4, 3), "mmax", "lmax")),
+        (lambda: Beam.from_blm(polarised), (polarised.shape, "T", "E", "B", LMAX)),
+        (lambda: beam.save(tmp_path / "beam.fits"), ("beam.fits", ".npz")),
+    ):
+        with refused(*named):
+            make()
+
+
 def test_beam_of_an_array_is_that_of_its_file(tmp_path) -> None:
     whole = np.zeros((LMAX + 1, LMAX + 1), complex)
     whole[:5] = Beam.elliptical(900.0, 600.0, angle_deg=30.0, lmax=LMAX, mmax=4).blm

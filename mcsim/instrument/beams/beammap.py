@@ -22,6 +22,8 @@ Projection = Literal["equidistant", "orthographic", "equal_area"]
 PEAK_BOX = 8
 DEFAULT_CUT_DEG = 3.5
 SMALLEST_CUT_PIXELS = 2
+NARROWEST_DEG = 1 / 30  #: of a beam whose header gives no unit: a narrower one may be one of up to 2 deg, in radians
+_UNITS = ("CUNIT1", "CUNIT2")
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +101,22 @@ def read_map(
     that the WMAP maps have the optic axis there, up to 3 deg away, is of the same order.
     """
     image, header = _read_image(user_path(path), plane)
-    pixel_deg = _pixel_deg(header, path) if pixel_deg is None else pixel_deg
-    return placed(image, pixel_deg, cut_deg=cut_deg, centre=centre, projection=projection, origin=str(path))
+    step_deg = _pixel_deg(header, path) if pixel_deg is None else pixel_deg
+    beam_map = placed(image, step_deg, cut_deg=cut_deg, centre=centre, projection=projection, origin=str(path))
+    if pixel_deg is None and not any(str(header.get(axis, "")).strip() for axis in _UNITS):
+        _check_unit(beam_map, step_deg, path)
+    return beam_map
+
+
+def _check_unit(beam_map: BeamMap, step: float, path: str | Path) -> None:
+    """Raise InputError if a header without a unit gives a beam so narrow in degrees that it may be in radians."""
+    pixels = 2.0 * np.sqrt(np.count_nonzero(beam_map.image > 0.5 * beam_map.image.max()) / pi)
+    if pixels * step < NARROWEST_DEG:
+        raise InputError(
+            f"{path} has steps of {step:g} without a unit (CDELT1, CUNIT1), and a beam {60.0 * pixels * step:.2g} "
+            f"arcmin wide if they are in degrees, or {60.0 * np.degrees(pixels * step):.2g} arcmin if in radians; give "
+            f"pixel_deg = {step:g} or {np.degrees(step):g}"
+        )
 
 
 def placed(
@@ -282,7 +298,7 @@ def _pixel_deg(header: fits.Header, path: str | Path) -> float:
         float(header.get(f"CD{axis}_{axis}", header.get(f"CDELT{axis}", 0.0) * header.get(f"PC{axis}_{axis}", 1.0)))
         for axis in (1, 2)
     )
-    for axis in ("CUNIT1", "CUNIT2"):
+    for axis in _UNITS:
         unit = str(header.get(axis, "deg")).strip().lower()
         if unit not in ("", "deg", "degree", "degrees"):
             raise InputError(f"{path} has {axis} = {unit!r} where degrees are expected: give pixel_deg")

@@ -38,7 +38,9 @@ def cut(blm: NDArray[np.complex128], lmax: int | None, origin: str) -> NDArray[n
     lmax = own if lmax is None else lmax
     check_lmax(lmax)
     if lmax > own:
-        raise InputError(f"{origin} stops at lmax = {own}, below the lmax = {lmax} asked for: lower lmax")
+        raise InputError(
+            f"{origin} stops at lmax = {own}, below the lmax = {lmax} asked for: lower lmax or give more coefficients"
+        )
     return blm[: lmax + 1, : lmax + 1]
 
 

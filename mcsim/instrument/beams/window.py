@@ -56,6 +56,8 @@ def read_window(
             found = _of_text(path)
     if found.ndim != 1 or not found.size or not np.all(np.isfinite(found)):
         raise InputError(f"{origin} holds no finite B_l, one for each l; repair it.")
+    if abs(found[0] + 1.0) <= 0.01:
+        raise InputError(f"{origin} starts at B_0 = {found[0]:g}, so its sign is reversed; multiply it by -1.")
     if abs(found[0] - 1.0) > 0.01 or np.abs(found).max() > LARGEST:
         raise InputError(
             f"{origin} starts at B_0 = {found[0]:g} and reaches {np.abs(found).max():g}, where B_l is 1 at l = 0 and "
@@ -64,7 +66,10 @@ def read_window(
     if lmax is not None and lmax < 0:
         raise InputError(f"lmax = {lmax} of {origin} is negative; give a degree.")
     if lmax is not None and found.size <= lmax:
-        raise InputError(f"{origin} holds B_l up to l = {found.size - 1}, but l = {lmax} is needed; lower lmax.")
+        raise InputError(
+            f"{origin} holds B_l up to l = {found.size - 1}, but l = {lmax} is needed; lower lmax or give a "
+            "longer table."
+        )
     return found if lmax is None else found[: lmax + 1]
 
 
