@@ -130,7 +130,7 @@ def compare(
         for number, pair in enumerate(sides.pairs):
             found.append(_channel(pair, sides, accuracy))
             progress(number + 1.0)
-    result = ComparisonResult(case, tuple(found), sides.not_compared)
+    result = ComparisonResult(case, tuple(found), sides.not_compared, sides.shown)
     if output is not None:
         text = json.dumps(result.to_dict(), indent=1, allow_nan=False) + "\n"
         with folders.filling(target := Path(output)), folders.replacing(target, "compare.json") as scratch:

@@ -18,6 +18,7 @@ from mcsim.comparison.description import (
     with_known_offsets,
     with_own_beams,
 )
+from mcsim.comparison.frames import common_frame
 from mcsim.comparison.missing import check_skies, not_compared, warn_of_effects
 from mcsim.comparison.result import NotCompared
 from mcsim.comparison.scene import Maps, PointingFiles, Scene, files_of, maps_of_files, scene_of
@@ -136,6 +137,7 @@ class Comparison:
     run: config.RunConfig | None
     not_compared: tuple[NotCompared, ...] = ()  #: maps that one side, or the model, lacks
     of_b: bool = False  #: True if the run is side B's own, and so describes that
+    shown: str | None = None  #: frame of the maps; None if neither the run nor a header says it
 
     @property
     def frame(self) -> str:
@@ -183,7 +185,7 @@ def read(
     drawn = run if run is None or any(map(_made_elsewhere, (a, b))) else quiet(run)
     noisy = (pair if drawn is None else _with_noise(pair, drawn) for pair in pairs)
     own_first = tuple(pair.exchanged() if of_b else pair for pair in noisy)
-    return Comparison(own_first, run, not_compared((a, b), sides, run), of_b)
+    return Comparison(own_first, run, not_compared((a, b), sides, run), of_b, common_frame(run, (a, b)))
 
 
 def _check_kind(side: str | Path) -> None:
@@ -213,7 +215,7 @@ def given(a: Given, b: Given, run: config.RunConfig, nthreads: int = 1) -> Compa
     sides = [dict(zip(names, side, strict=True)) for side in (a, b)]
     found = (_pair(name, maps, sides, whole, nthreads) for name, maps in _groups(run).items())
     pairs = (replace(pair, orders=orders.get(pair.name)) for pair in found)
-    return Comparison(tuple(_with_noise(pair, run) for pair in pairs), run)
+    return Comparison(tuple(_with_noise(pair, run) for pair in pairs), run, shown=common_frame(run, ()))
 
 
 def _groups(run: config.RunConfig) -> dict[str, list[str]]:

@@ -35,7 +35,10 @@ _ROUNDED = 1e-20  #: power over the largest of side A below which it is that of 
 
 def page(result: ComparisonResult) -> str:
     """Return the page as text."""
-    pictures = [(channel, page_.embedded(page_.png(figure(channel), DOTS_PER_INCH))) for channel in result.channels]
+    pictures = [
+        (channel, page_.embedded(page_.png(figure(channel, result.frame), DOTS_PER_INCH)))
+        for channel in result.channels
+    ]
     return page_.render(
         Path(__file__).with_name("report.html.j2"),
         {"number": number},
@@ -44,15 +47,18 @@ def page(result: ComparisonResult) -> str:
     )
 
 
-def figure(channel: ChannelResult) -> Figure:
-    """Draw the first map of a channel that differs: both sides, their difference and its parts, spectra, and hits."""
+def figure(channel: ChannelResult, frame: str | None = None) -> Figure:
+    """Draw the first map of a channel that differs: both sides, their difference and its parts, spectra, and hits.
+
+    ``frame``: of the maps, for the title.
+    """
     made = Figure(figsize=(12.0, 7.4), layout="constrained")
     axes = made.subplot_mosaic("aabbcc;ddeeff;ggghhh", height_ratios=(1.0, 1.0, 1.15))
     first = _first(channel)
     a, b, explained, seen = (one[first] for one in (channel.a, channel.b, channel.explained, channel.seen))
     difference = b - a
     for key, title, values, signed in (
-        ("a", f"A, {channel.splits[first]}", a, False),
+        ("a", ", ".join(filter(None, ("A", channel.splits[first], frame))), a, False),
         ("b", "B", b, False),
         ("c", "B − A", difference, True),
         ("d", "explained", explained, True),

@@ -182,6 +182,8 @@ class ComparisonResult:
         One result for every channel.
     not_compared
         Maps that one side, or the model, lacks.
+    frame
+        Frame of the maps, "ecliptic", "galactic" or "equatorial"; None if neither a model nor a header says it.
 
     Examples
     --------
@@ -196,6 +198,7 @@ class ComparisonResult:
     case: str
     channels: tuple[ChannelResult, ...]
     not_compared: tuple[NotCompared, ...] = ()
+    frame: str | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -225,6 +228,7 @@ class ComparisonResult:
             "schema": 1,
             "case": self.case,
             "verdict": self.verdict,
+            "frame": self.frame,
             "accuracy": self.accuracy,
             "difference": {
                 "rms_uk": rms,

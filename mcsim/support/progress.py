@@ -97,8 +97,9 @@ class _Lines(Reporter):
         self.last, self.state = self.start, (0.0, 0)
 
     def __call__(self, finished: float, failed: int = 0) -> None:
-        now, self.state = time.monotonic(), (finished, failed)
-        if now - self.last >= EVERY_S or (finished >= self.total and not self.grows):
+        now, before, self.state = time.monotonic(), self.state, (finished, failed)
+        ended = finished >= self.total and not self.grows and self.state != before
+        if now - self.last >= EVERY_S or ended:
             self.last = now
             self._print(finished, failed)
 

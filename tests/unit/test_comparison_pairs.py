@@ -1,11 +1,15 @@
 """Two sets of maps in pairs: holes, maps that differ, and what a set of differences must explain."""
 
+from pathlib import Path
+
 import healpy
 import numpy as np
 import pytest
 
+from mcsim.comparison.frames import common_frame
 from mcsim.comparison.pairs import ChannelPair, _pair, _without_holes
 from mcsim.comparison.prediction import Prediction, Set
+from refusals import refused
 
 NPIX = 12
 
@@ -104,3 +108,29 @@ def test_nothing_is_looked_for_in_what_is_smaller_than_identical_maps() -> None:
     least = (0.05 / 20.0) ** 2
     assert problem.enough == pytest.approx(least)
     assert [problem.complete(Set((), share * least)) for share in (0.9, 1.1)] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "frame"), [("G", "G", "galactic"), ("E", None, "ecliptic"), (None, None, None)]
+)
+def test_maps_without_a_model_are_in_the_frame_of_their_headers(
+    one: str | None, other: str | None, frame: str | None, tmp_path: Path
+) -> None:
+    assert common_frame(None, two_sides(tmp_path, one, other)) == frame
+
+
+def test_maps_of_two_frames_are_not_compared_pixel_by_pixel(tmp_path: Path) -> None:
+    """They were called identical, without a word on their headers; a map that one side lacks does not count."""
+    sides = two_sides(tmp_path, "G", "E")
+    with refused(*(side / "W.fits" for side in sides), "galactic", "ecliptic", "COORDSYS"):
+        common_frame(None, sides)
+    (sides[1] / "W.fits").rename(sides[1] / "V.fits")
+    assert common_frame(None, sides) is None
+
+
+def two_sides(folder: Path, *coordinates: str | None) -> list[Path]:
+    sides = [folder / "one", folder / "other"]
+    for side, coordinate in zip(sides, coordinates, strict=True):
+        side.mkdir()
+        healpy.write_map(side / "W.fits", np.arange(float(NPIX)), coord=coordinate, column_units="uK", dtype=float)
+    return sides

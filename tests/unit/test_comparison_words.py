@@ -84,9 +84,9 @@ def test_names_with_the_signs_of_mathematics_are_drawn_as_they_are() -> None:
         *(1.0, 100.0, 0.0, 0.0, 0.0, (), 0.0),
         *(maps, maps + 1.0, maps, maps >= 0.0, 0, None, ("a$_$b",)),
     )
-    picture = report.figure(found)
+    picture = report.figure(found, "galactic")
     picture.draw_without_rendering()
-    assert "A, a$_$b" in picture.axes[0].get_title()
+    assert "A, a$_$b, galactic:" in picture.axes[0].get_title()
 
 
 @pytest.mark.parametrize(

@@ -23,4 +23,5 @@ def test_work_of_known_size_ends_in_a_line(capsys):
     with reporting("chunks", 2.0, "chunks") as report:
         report(1.0)
         report(2.0)
+        report(2.0)  # of a part that has none
     assert capsys.readouterr().err.count("chunks: 2/2") == 1

@@ -189,10 +189,9 @@ class Moments:
         check_frame(frame)
         given = {"theta": theta, "phi": phi, "psi": psi}
         arrays = [np.atleast_1d(reals(angle, name)) for name, angle in given.items()]
-        shapes = [array.shape for array in arrays]
-        if shapes == [(0,)] * 3:
+        if [array.size for array in arrays] == [0, 0, 0]:
             raise InputError("theta, phi and psi hold no sample; give one at least.")
-        if len(set(shapes)) > 1 or arrays[0].ndim != 1:
+        if len(set(shapes := [array.shape for array in arrays])) > 1 or arrays[0].ndim != 1:
             raise InputError(f"theta, phi and psi have the shapes {shapes}; give three arrays of one length, (n,).")
         samples = checked_samples(arrays, "the pointing")
         return cls._from_sums(sums_of_samples([samples], nside, smax), MapGrid(nside, frame))
