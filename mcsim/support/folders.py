@@ -149,7 +149,10 @@ def _is_array(metadata: Path) -> bool:
 
 def is_full(error: BaseException | None) -> bool:
     """Return True for an error of a disk, or a quota, that is full: the input is not to blame."""
-    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return isinstance(error, OSError) and (error.errno in (errno.ENOSPC, errno.EDQUOT) or _FULL in str(error))
+
+
+_FULL = " requested and "  #: numpy wrote less than that, and raises no number; nor does astropy, which adds to it
 
 
 @contextmanager
@@ -159,7 +162,8 @@ def unwritable(name: str | Path, remedy: str) -> Iterator[None]:
         yield
     except OSError as error:
         if is_full(error):
-            raise RunError(f"{name} cannot be written ({error.strerror}); make room there and try again.") from error
+            why = error.strerror or os.strerror(errno.ENOSPC)
+            raise RunError(f"{name} cannot be written ({why}); make room there and try again.") from error
         raise InputError(f"{name} cannot be written ({error.strerror or error}); {remedy}.") from error
 
 

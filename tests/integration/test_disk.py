@@ -22,6 +22,7 @@ from mcsim.datavector.analysis import analysis_of
 from mcsim.datavector.kept import Kept
 from mcsim.diagnosis import report
 from mcsim.ensemble import repair, runner, store
+from mcsim.ensemble.maps import write_maps
 from mcsim.ensemble.store import write_dataset
 from mcsim.errors import RunError
 from mcsim.instrument.scan import Moments
@@ -162,6 +163,14 @@ def test_an_array_on_a_full_disk_is_named(disk: Path) -> None:
     with refused(disk, by=RunError), pytest.MonkeyPatch.context() as patch:
         patch.setenv("MCSIM_CACHE", str(disk))
         cached("other", moments.save)
+
+
+def test_maps_on_a_full_disk_are_not_blamed_on_the_folder(disk: Path) -> None:
+    """astropy repeated itself, and exit code 2 said that the input is wrong."""
+    assert remount(disk, "size=16k")
+    with refused(disk / "maps", by=RunError, errno=errno.ENOSPC):
+        write_maps(table(), disk / "maps", realizations=0, quiet=True)
+    assert not [path for path in disk.rglob("*") if path.is_file()]
 
 
 def test_a_simulation_that_a_full_disk_cannot_keep_leaves_nothing(disk: Path) -> None:
