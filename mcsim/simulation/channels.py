@@ -19,6 +19,7 @@ from mcsim.instrument.scan.offsets import HIGHEST
 from mcsim.simulation.timestream import nyquist_hz
 from mcsim.sphere import rotation
 from mcsim.support import resources
+from mcsim.systematics.hooks import HOOKS
 
 CIRCULAR = (config.BeamGaussian, config.BeamWindow)  #: beams that have no m_max
 WHOLE = 4  #: orders that a beam has at least without its m_max, where its source has them
@@ -169,6 +170,21 @@ def check_effects(run: config.RunConfig) -> None:
                 refuse_misplaced(run, spec, acting)
                 site = site_of(run, spec)
                 _warn_of_orders(run, spec, systematics.tried(acting, site), site.beam)
+                for effect in acting:
+                    _warn_of_nothing(effect, site)
+
+
+def _warn_of_nothing(effect: systematics.Effect, site: systematics.Site) -> None:
+    """Warn of an effect on one channel that can only change gain or noise there, and does not."""
+    others = [hook for hook in HOOKS if hook not in ("gain", "noise")]
+    if effect.scope != "channel" or effect.amplitude == 0.0 or systematics.acts_through(effect, *others):
+        return
+    if effect.gain(np.zeros(1), site) is None and effect.noise(site) is None:
+        warnings.warn(
+            f"effect {effect.name} does nothing on channel {site.channel}: its hooks return None at amplitude = "
+            f"{effect.amplitude:g}; if a return is missing, add it.",
+            stacklevel=3,
+        )
 
 
 def refuse_misplaced(run: config.RunConfig, spec: config.Channel, acting: tuple[systematics.Effect, ...]) -> None:

@@ -11,10 +11,11 @@ import mcsim
 from instruments import two_channels
 from mcsim import config, systematics
 from mcsim.simulation import simulate
+from mcsim.simulation.channels import check_effects
 from mcsim.simulation.nuisance import DisturbedSurvey, tables
 from mcsim.simulation.survey import survey
 from mcsim.systematics import Site
-from refusals import refused
+from refusals import refused, unnamed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +71,31 @@ def test_an_effect_may_leave_fewer_orders_than_the_model_has():
     )
     found = survey(acting, library={**systematics.catalogue(), "rounded": Rounded})
     np.testing.assert_allclose(simulate.maps(found, 0), simulate.maps(survey(fiducial), 0), atol=1e-9)
+
+
+FORGOTTEN = """
+from dataclasses import dataclass
+import mcsim
+
+
+@dataclass(frozen=True, kw_only=True)
+class Forgotten(mcsim.Effect):
+    name, scope, unit, step = "forgotten", "channel", "fraction", 0.01
+    cause = signature = source = "A test."
+
+    def gain(self, time_s, site):
+        self.amplitude * time_s
+"""
+
+
+def test_a_gain_whose_return_is_forgotten_is_told_of(tmp_path):
+    """Such a run was the one without the effect, without a word."""
+    (tmp_path / "forgotten.py").write_text(FORGOTTEN)
+    table = two_channels("own", lmax=12, nside=8, sigma0_uk=0.0, period_s=300.0)
+    effect = {"name": str(tmp_path / "forgotten.py"), "channel": table["channel"][0]["name"], "amplitude": 0.1}
+    with pytest.warns(UserWarning, match="forgotten") as told:
+        check_effects(config.load(table | {"effect": [effect]}))
+    assert unnamed(str(told[0].message), "forgotten", effect["channel"], 0.1) == []
 
 
 @pytest.mark.parametrize("kind", [BentGain, BentSignal, HighGain])
