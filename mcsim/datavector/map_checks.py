@@ -212,7 +212,7 @@ def check_subtracted(model: Model, given: Mapping[str, Map]) -> None:
         if abs(share - 1.0) < 1.0 - WHOLE and error < (1.0 - WHOLE) / 2.0:
             raise InputError(
                 f"{name} has {share:.3g} times the dipole of the CMB, {np.linalg.norm(dipole):g} uK, in it, which is "
-                "subtracted from simulations; subtract it (a [[preparation]] subtract_dipole does so to both)."
+                "subtracted from simulations; subtract it, as mcsim prepare does by a step subtract_dipole."
             )
 
 
