@@ -140,7 +140,7 @@ def _units(analysis: Analysis) -> Iterator[Map]:
     survey = analysis.model.survey
     for draw in range(_draws(analysis)):
         noise = rng.generator(survey.config.ensemble.seed, draw, "noise in common")
-        yield noise.standard_normal(12 * survey.making.nside**2)
+        yield noise.standard_normal(survey.making.maps[0].moments.npix)
 
 
 def _noise(analysis: Analysis, factors: dict[int, int], unit: Map) -> list[Map]:

@@ -98,6 +98,22 @@ def test_prepared_maps_of_the_model_agree_with_it_and_an_effect_is_found(maps, t
 
 
 @pytest.mark.slow
+def test_noise_in_common_to_prepared_maps_is_told():
+    """What it does is simulated in the pixels in which maps are made, not in those of prepared maps."""
+    run = model()
+    made = survey(replace(run, preparation=(), map=replace(run.map, mask=None)))
+    sky = np.array(simulate.maps(made.without_noise, 0))
+    noise = np.array(simulate.maps(made, 0)) - sky
+    v1, w1 = (one.noise_uk for one in made.maps)
+    noise[1] = 0.8 * w1 / v1 * noise[0] + 0.6 * noise[1]
+    found = diagnosed(run, mcsim.prepare(list(sky + noise), run))
+    assert found.kind == "unknown"
+    (sentence,) = found.orders
+    correlation, sigma = map(float, sentence.rpartition("correlation ")[2].rstrip(").").split(" ± "))
+    assert abs(correlation - 0.8) < 3.0 * sigma < 0.4
+
+
+@pytest.mark.slow
 def test_a_model_that_lacks_power_of_the_sky_is_told_so(maps, tmp_path):
     """Without the steps and the power above l = 20. Nothing of the verdict is asked, so few simulations will do."""
     bare = diagnosed(model(20, steps=False), maps, tmp_path, 200)
