@@ -17,7 +17,7 @@ from mcsim.ensemble.external_maps import in_uk, parts_of
 from mcsim.ensemble.maps import POINTING, file_names, first_realization
 from mcsim.errors import InputError
 from mcsim.simulation import simulate
-from mcsim.sphere import healpix, map_files
+from mcsim.sphere import alm, healpix, map_files
 from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.sphere.header import T_CMB_K, first_table, opened
 from mcsim.sphere.mask import kept_mask
@@ -217,17 +217,15 @@ def check_subtracted(model: Model, given: Mapping[str, Map]) -> None:
 
 
 def _share_of(pattern: Map, model: Model, part: Part, map_: Map, seen: NDArray[np.bool_]) -> tuple[float, float]:
-    """Return how many times a pattern is in the seen pixels of a map, and an error that is rather too large.
-
-    The sky has few modes that look like a dipole, and counts as one; noise is of single pixels.
-    """
-    t = pattern[seen] - np.mean(pattern[seen])
+    """Return how many times a pattern is in the seen pixels of a map, and the error by sky and noise of the model."""
+    t = np.where(seen, pattern - np.mean(pattern[seen]), 0.0)
     square = float(t @ t)
     if square == 0.0:
         return 0.0, np.inf
-    sky = sky_variance(model.cl, model.response[part.channel]) * t.size / square
-    noise = float(np.sum(t**2 / part.precision[seen])) / square**2
-    return float(t @ map_[seen]) / square, float(np.sqrt(sky + noise))
+    power = alm.power(healpix.adjoint(t, model.lmax), model.lmax)
+    sky = float(np.dot(model.cl * model.response[part.channel] ** 2, power))
+    noise = float(np.sum(t[seen] ** 2 / part.precision[seen]))
+    return float(t[seen] @ map_[seen]) / square, float(np.sqrt(sky + noise)) / square
 
 
 def check_splits_differ(model: Model) -> None:
