@@ -31,7 +31,7 @@ def stretched(window: Window, nside: int, spread: float) -> Window:
     power, lmax = spread * spread, window.size - 1
     if power == 1.0 or np.all(window == 1.0):
         return window
-    own = healpix.pixel_window(nside, lmax * int(np.ceil(max(abs(spread), 1.0))))
+    own = healpix.pixel_window(nside, (lmax + 1) * int(np.ceil(max(abs(spread), 1.0))))
     there = np.sqrt(0.25 + power * np.arange(lmax + 1.0) * np.arange(1.0, lmax + 2.0)) - 0.5
     return np.asarray(np.interp(there, np.arange(own.size), own) * (window / own[: lmax + 1]) ** power)
 

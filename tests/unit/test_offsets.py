@@ -235,6 +235,8 @@ def test_samples_farther_from_the_centres_have_the_window_of_larger_pixels(nside
     for same, spread in ((own, 1.0), (own, -1.0), (np.ones(161), apart)):
         assert np.array_equal(windows.stretched(same, nside, spread), same)
     np.testing.assert_allclose(windows.stretched(own, nside, 0.0), 1.0, atol=1e-6)
+    # The last degree is that of a longer table too: farther out it looks for one of (apart - 1) / 2 degrees more.
+    np.testing.assert_allclose(windows.stretched(own[:97], nside, apart)[-1], windows.stretched(own, nside, apart)[96])
 
 
 def test_spread_to_nothing_is_a_survey_of_centres(sky, beam, streamed) -> None:
