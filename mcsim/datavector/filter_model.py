@@ -116,8 +116,8 @@ class Model:
 
     @cached_property
     def hides(self) -> bool:
-        """Return True if a map lacks a part of the sky that is more than little, or hardly sees it."""
-        return hides(self.parts, self.settings)
+        """Return True if a map lacks a part of the sky that is more than little."""
+        return hidden_share(self.parts) >= self.settings.hidden_share
 
     @cached_property
     def masks(self) -> tuple[Map, ...]:
@@ -154,9 +154,10 @@ class Model:
 
         Noise that is more at some degrees than at others is white noise and a sky of its own, with which it is found.
         To an isotropic filter zeros in a mask are data: skies that filtered maps constrain had many times their power
-        at high degrees. Of maps that show the sky beyond lmax it is that of their mean. None: nothing is hidden.
+        at high degrees. Of maps that show the sky beyond lmax it is that of their mean. None where an isotropic filter
+        wastes little.
         """
-        if not self.hides:
+        if not _wastes(self.parts, self.sky_power, self.bright, self.settings):
             return None
         parts, templates = [], templates_of(self.survey.preparations)
         for part, mask, own in zip(self.parts, self.masks, templates, strict=True):
@@ -256,13 +257,13 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     bright = bool(np.any(white[lmax + 1 :] > 1.0))
     cl, snr = survey.cl[: lmax + 1], snr[: lmax + 1]
     response, colours = response[:, : lmax + 1], colours[:, : lmax + 1]
-    known, inverse = pixels and not bright and bool(snr[lmax] <= SHARP), None
-    if known and hides(parts, settings):
+    known, inverse, sky_power = pixels and not bright and bool(snr[lmax] <= SHARP), None, snr / (1.0 + snr)
+    if known and _wastes(parts, sky_power, bright, settings):
         parts = list(marginalised(survey, parts))
         inverse = inverse_of(cl, response, parts)
     maps = survey.nside, cl, response, tuple(parts), dipole_alm(survey.channels[0].site.dipole_uk, lmax)
     exact = known and independent
-    model = Model(survey, lmax, *maps, inverse, exact, colours, snr / (1.0 + snr), settings, bright=bright)
+    model = Model(survey, lmax, *maps, inverse, exact, colours, sky_power, settings, bright=bright)
     return replace(_pooled(model), exact_known=independent) if pixels and bright else model
 
 
@@ -277,18 +278,23 @@ def _colour(preparation: Preparation, fine: int, floor: float, size: int) -> Cl:
     return np.asarray(floor * area + (1.0 - floor * area) * window)
 
 
-def hides(parts: Sequence[Part], settings: DiagnosisSettings) -> bool:
-    """Return True if maps lack so much of the sky, or have so uneven noise, that an isotropic filter wastes it.
+def hidden_share(parts: Sequence[Part]) -> float:
+    """Return the share of the sky that the map which lacks most of it does not show."""
+    return max(float(np.mean(part.precision == 0.0)) for part in parts)
 
-    That filter takes the noise for the mean variance everywhere; what maps tell of the largest scales follows the mean
-    of the inverse.
+
+def _wastes(parts: Sequence[Part], sky_power: Cl, bright: bool, settings: DiagnosisSettings) -> bool:
+    """Return True if an isotropic filter wastes much: maps lack a part of the sky, or have very uneven noise.
+
+    It takes the noise for the mean variance everywhere; what maps tell of the largest scales follows the mean of the
+    inverse. Where the sky is far above the noise, or is seen beyond lmax, the inverse covariance takes it for noise,
+    and tells less of a full sky than the isotropic filter.
     """
-    for part in parts:
-        seen = part.precision[part.precision > 0.0]
-        uneven = float(np.mean(1.0 / seen) * np.mean(seen))
-        if 1.0 - seen.size / part.precision.size >= settings.hidden_share or uneven > settings.uneven_noise:
-            return True
-    return False
+    if hidden_share(parts) >= settings.hidden_share:
+        return True
+    seen = (part.precision[part.precision > 0.0] for part in parts)
+    uneven = max(float(np.mean(1.0 / one) * np.mean(one)) for one in seen)
+    return not bright and bool(sky_power[-1] <= SHARP / (1.0 + SHARP)) and uneven > settings.uneven_noise
 
 
 def _pooled(model: Model) -> Model:

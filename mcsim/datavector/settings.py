@@ -149,7 +149,7 @@ class DiagnosisSettings:
         sky beyond the filters have that of their mean in any case.
     uneven_noise
         Mean variance of the noise of a map's pixels times the mean of its inverse, 1 for even noise, above which maps
-        are filtered so on the full sky too.
+        are filtered so on the full sky too, unless the sky is far above the noise at the last degree.
     filter_tolerance, filter_iterations
         At which the conjugate gradients of that filter end for typical maps: what is left of the system, relative to
         what the filter leaves of the sky, and most iterations. Simulations and data go through the same ones, so that
