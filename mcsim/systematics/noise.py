@@ -5,15 +5,17 @@ from pathlib import Path
 
 import healpy
 import numpy as np
-from numpy.typing import NDArray
 
 from mcsim.errors import InputError
 from mcsim.sphere import healpix, map_files
 from mcsim.sphere.checks import check_complete
 from mcsim.sphere.rotation import rotation_matrix
 from mcsim.support.arrays import divided
+from mcsim.support.loading import once_per_content
 from mcsim.systematics.base import Bound, Effect, Map, Site, Wording
 from mcsim.systematics.parametrization import Parametrization, Vector
+
+AT_ONCE = 1 << 20  #: pixels of a template that are sorted at once: those of nside 2048 would take 3 GB together
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,11 +72,10 @@ class NoiseAnisotropy(Effect):
     def noise(self, site: Site) -> Map | None:
         if self.amplitude == 0.0:
             return None
-        centres = healpix.centres(site.nside)
         if self.template:
-            pattern = _of_file(self.template, site, centres)
+            pattern = _of_file(self.template, site.nside, site.frame)
         else:
-            pattern = 3.0 * (rotation_matrix(site.frame, "ecliptic")[2] @ centres) ** 2 - 1.0
+            pattern = 3.0 * (rotation_matrix(site.frame, "ecliptic")[2] @ healpix.centres(site.nside)) ** 2 - 1.0
         factor = 1.0 + self.amplitude * pattern
         if factor.min() < 0.0:
             raise InputError(
@@ -111,20 +112,25 @@ class NoiseKnee(Effect):
         return (1.0 + self.amplitude) * f_knee_hz
 
 
-def _of_file(path: str, site: Site, centres: NDArray[np.float64]) -> Map:
-    """Return a template in the pixels of a site, whose ``centres`` are given: means over those of a finer one.
+@once_per_content(4)
+def _of_file(path: str, nside: int, frame: str) -> Map:
+    """Return a template in the pixels of maps in a frame, once for all surveys of a process: means over finer ones.
 
     The variance of a pixel's mean is that of its samples, on average.
     """
     values, found, _ = map_files.read_map(Path(path))
     check_complete(values, path)
-    nside, turn = healpy.npix2nside(values.size), rotation_matrix(site.frame, found or site.frame)
-    nearest = values[healpy.vec2pix(nside, *(turn @ centres))]
-    if nside <= site.nside:
-        return np.asarray(nearest)
-    pixel, npix = healpy.vec2pix(site.nside, *(turn.T @ healpix.centres(nside))), centres.shape[1]
-    count = np.bincount(pixel, minlength=npix)
-    return np.where(count > 0, divided(np.bincount(pixel, values, npix), count), nearest)
+    fine, turn = healpy.npix2nside(values.size), rotation_matrix(frame, found or frame)
+    pattern = values[healpy.vec2pix(fine, *(turn @ healpix.centres(nside)))]
+    if fine > nside:
+        count, total = np.zeros((2, pattern.size))
+        for part in np.array_split(np.arange(values.size), -(-values.size // AT_ONCE)):
+            inside = healpy.vec2pix(nside, *(turn.T @ np.stack(healpy.pix2vec(fine, part))))
+            count += np.bincount(inside, minlength=pattern.size)
+            total += np.bincount(inside, values[part], pattern.size)
+        pattern = np.where(count > 0.0, divided(total, count), pattern)
+    pattern.setflags(write=False)
+    return pattern
 
 
 MOST_HITS = 1e6  #: of a sample on average: more are no glitches, and too many to count

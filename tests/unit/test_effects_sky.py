@@ -12,10 +12,11 @@ from mcsim.datavector.candidate import Candidate
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import healpix
+from mcsim.sphere import healpix, map_files
 from mcsim.sphere.rotation import rotate_alm, rotate_pixels
 from mcsim.sphere.sky import dipole_alm, gaussian_alm
 from mcsim.sphere.spectra import load
+from mcsim.systematics import noise
 from mcsim.systematics import sky as effects_on_sky
 from refusals import refused
 
@@ -315,13 +316,17 @@ def test_noise_after_a_template(site, tmp_path):
         kind(amplitude=-1.1, template=path).noise(site)
 
 
-def test_noise_of_a_pixel_has_the_mean_of_a_finer_template(site, tmp_path):
-    """It had the value at the centre, one of 64 for a template of eight times the nside."""
+def test_noise_of_a_pixel_has_the_mean_of_a_finer_template(site, tmp_path, monkeypatch):
+    """It had the value at the centre, one of 64 for a template of eight times the nside; which is read once."""
+    monkeypatch.setattr(noise, "AT_ONCE", 1000)
     path = str(tmp_path / "fine.fits")
     pattern = np.random.default_rng(8).uniform(-1.0, 1.0, 12 * (8 * NSIDE) ** 2)
     healpy.write_map(path, pattern, dtype=np.float64)
-    factor = systematics.get("noise_anisotropy")(amplitude=0.5, template=path).noise(site)
-    np.testing.assert_allclose(factor, 1.0 + 0.5 * healpy.ud_grade(pattern, NSIDE), rtol=1e-12)
+    kind = systematics.get("noise_anisotropy")
+    found = kind(amplitude=0.5, template=path).noise(site)
+    np.testing.assert_allclose(found, 1.0 + 0.5 * healpy.ud_grade(pattern, NSIDE), rtol=1e-12)
+    monkeypatch.setattr(map_files, "read_map", None)
+    np.testing.assert_allclose(kind(amplitude=1.0, template=path).noise(site) - 1.0, 2.0 * (found - 1.0), atol=1e-12)
 
 
 def test_foregrounds_after_a_template(site, sky, tmp_path):
