@@ -10,21 +10,23 @@ from mcsim.sphere.header import opened, stated_frame
 
 
 def common_frame(run: config.RunConfig | None, sides: Sequence[str | Path]) -> str | None:
-    """Return the frame of the maps of a run, or of folders without one: what headers say; None if none says it.
+    """Return the frame of the maps of a run, or of folders without one: what headers say; None if none says one alone.
 
-    Raise InputError if headers of maps that are compared say several.
+    Raise InputError if the headers of two maps that are compared say two.
     """
     if run is not None:
         return config.prepared_grid(run)[1]
-    files = [{path.name: path for path in first_realization(Path(side)).glob("*.fits")} for side in sides]
-    stated: dict[str, Path] = {}
-    for side in files:
-        for name in sorted(files[0].keys() & files[1].keys()):
-            with opened(side[name]) as hdus:
-                frame = stated_frame(hdus, str(side[name]))
-            if frame is not None:
-                stated.setdefault(frame, side[name])
-    if len(stated) > 1:
-        words = ", ".join(f"{path} is in {frame} coordinates" for frame, path in stated.items())
-        raise InputError(f"{words}; rotate the maps to one frame, or correct the headers (COORDSYS).")
-    return next(iter(stated), None)
+    a, b = ({path.name: path for path in first_realization(Path(side)).glob("*.fits")} for side in sides)
+    every: set[str] = set()
+    for name in sorted(a.keys() & b.keys()):
+        stated = {frame: side[name] for side in (a, b) if (frame := _stated(side[name])) is not None}
+        if len(stated) > 1:
+            words = ", ".join(f"{path} is in {frame} coordinates" for frame, path in stated.items())
+            raise InputError(f"{words}; rotate the maps to one frame, or correct the headers (COORDSYS).")
+        every |= stated.keys()
+    return every.pop() if len(every) == 1 else None
+
+
+def _stated(path: Path) -> str | None:
+    with opened(path) as hdus:
+        return stated_frame(hdus, str(path))

@@ -137,7 +137,7 @@ class Comparison:
     run: config.RunConfig | None
     not_compared: tuple[NotCompared, ...] = ()  #: maps that one side, or the model, lacks
     of_b: bool = False  #: True if the run is side B's own, and so describes that
-    shown: str | None = None  #: frame of the maps; None if neither the run nor a header says it
+    shown: str | None = None  #: frame of the maps; None if neither the run nor headers say one alone
 
     @property
     def frame(self) -> str:

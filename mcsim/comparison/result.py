@@ -183,7 +183,7 @@ class ComparisonResult:
     not_compared
         Maps that one side, or the model, lacks.
     frame
-        Frame of the maps, "ecliptic", "galactic" or "equatorial"; None if neither a model nor a header says it.
+        Frame of the maps, "ecliptic", "galactic" or "equatorial"; None if neither a model nor headers say one alone.
 
     Examples
     --------

@@ -126,6 +126,10 @@ def test_maps_of_two_frames_are_not_compared_pixel_by_pixel(tmp_path: Path) -> N
         common_frame(None, sides)
     (sides[1] / "W.fits").rename(sides[1] / "V.fits")
     assert common_frame(None, sides) is None
+    # Maps of two channels are not compared, and each may be in a frame of its own.
+    for number, name in ((0, "V.fits"), (1, "W.fits")):
+        (sides[number] / name).write_bytes((sides[1 - number] / name).read_bytes())
+    assert common_frame(None, sides) is None
 
 
 def two_sides(folder: Path, *coordinates: str | None) -> list[Path]:
