@@ -31,6 +31,7 @@ from mcsim.cli.common import (
     save,
 )
 from mcsim.errors import InputError, RunError
+from mcsim.support.folders import is_full, reason
 from mcsim.support.loading import loaded
 
 app = typer.Typer(
@@ -59,10 +60,10 @@ def main() -> None:
         print(f"mcsim: not enough memory ({error}); lower nside, lmax, smax or the workers.", file=sys.stderr)
         sys.exit(1)
     except OSError as error:
-        if error.errno is None:  # no word of the system's
+        if error.errno is None and not is_full(error):  # no word of the system's
             raise
         what = error.filename or "the output"
-        print(f"mcsim: {what}: {error.strerror}; check its permissions and the space on its disk.", file=sys.stderr)
+        print(f"mcsim: {what}: {reason(error)}; check its permissions and the space on its disk.", file=sys.stderr)
         sys.exit(1)
 
 

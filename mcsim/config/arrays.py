@@ -125,7 +125,7 @@ def kept(write: Callable[[Path], Any], what: str) -> Path:
     except OSError as error:
         kind, room = (RunError, "make room there, or ") if folders.is_full(error) else (InputError, "")
         raise kind(
-            f"cache folder {str(root)!r} cannot take what is given as {what} ({error.strerror}); {room}set "
+            f"cache folder {str(root)!r} cannot take what is given as {what} ({folders.reason(error)}); {room}set "
             "MCSIM_CACHE to one that can."
         ) from None
 

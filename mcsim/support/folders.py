@@ -155,6 +155,11 @@ def is_full(error: BaseException | None) -> bool:
 _FULL = " requested and "  #: numpy wrote less than that, and raises no number; nor does astropy, which adds to it
 
 
+def reason(error: OSError) -> str:
+    """Return why the file system refuses."""
+    return error.strerror or (os.strerror(errno.ENOSPC) if is_full(error) else str(error))
+
+
 @contextmanager
 def unwritable(name: str | Path, remedy: str) -> Iterator[None]:
     """Turn the file system's refusal to write into an InputError, and a full disk into a RunError."""
@@ -162,9 +167,8 @@ def unwritable(name: str | Path, remedy: str) -> Iterator[None]:
         yield
     except OSError as error:
         if is_full(error):
-            why = error.strerror or os.strerror(errno.ENOSPC)
-            raise RunError(f"{name} cannot be written ({why}); make room there and try again.") from error
-        raise InputError(f"{name} cannot be written ({error.strerror or error}); {remedy}.") from error
+            raise RunError(f"{name} cannot be written ({reason(error)}); make room there and try again.") from error
+        raise InputError(f"{name} cannot be written ({reason(error)}); {remedy}.") from error
 
 
 @contextmanager
@@ -174,7 +178,7 @@ def filling(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         yield
     except OSError as error:
-        why = error.strerror or error
+        why = reason(error)
         raise RunError(f"{folder} cannot be written ({why}); make room there, and run the command again.") from error
 
 
@@ -279,11 +283,11 @@ def cached(name: str, fill: Callable[[Path], None]) -> Path:
                     with suppress(FileNotFoundError):  # another process removes it, too
                         shutil.rmtree(place)
         except OSError as error:
-            if error.errno is None:  # from a connection or a timeout, not from a file
+            if error.errno is None and not is_full(error):  # from a connection or a timeout, not from a file
                 raise
             kind, room = (RunError, "make room there, or ") if is_full(error) else (InputError, "")
             raise kind(
-                f"cache folder {str(root)!r} cannot be written ({error.strerror}); {room}set "
+                f"cache folder {str(root)!r} cannot be written ({reason(error)}); {room}set "
                 "MCSIM_CACHE to one that can."
             ) from None
     return folder

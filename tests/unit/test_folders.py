@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+from mcsim.config import arrays
 from mcsim.errors import InputError, RunError
 from mcsim.support.folders import appearing, cached, default_cache_dir, unwritable, user_path
 from refusals import refused
@@ -127,14 +128,20 @@ def test_a_file_in_the_way_is_an_error(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("number", "kind"), [(errno.ENOSPC, RunError), (errno.EDQUOT, RunError), (errno.EROFS, InputError)]
+    ("said", "number", "kind"),
+    [
+        *(((one, os.strerror(one)), one, RunError) for one in (errno.ENOSPC, errno.EDQUOT)),
+        (("5 requested and 0 written",), errno.ENOSPC, RunError),  # as numpy says it, without a number
+        ((errno.EROFS, os.strerror(errno.EROFS)), errno.EROFS, InputError),
+    ],
 )
-def test_a_full_disk_is_no_bad_input(cache, number, kind):
-    def fail(folder=None):
-        raise OSError(number, os.strerror(number))
+def test_a_full_disk_is_no_bad_input(cache, said, number, kind):
+    def fail(*given):
+        raise OSError(*said)
 
-    with refused("MCSIM_CACHE", by=kind, errno=number):
-        cached("name", fail)
+    for written in (lambda: cached("name", fail), lambda: arrays.kept(fail, "mask")):
+        with refused("MCSIM_CACHE", by=kind, errno=number):
+            written()
     with refused(cache, by=kind, errno=number) as caught, unwritable(cache, "choose another"):
         fail()
     assert ("choose another" in str(caught.value)) == (kind is InputError)
