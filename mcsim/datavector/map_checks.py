@@ -15,7 +15,7 @@ from mcsim.datavector.parts import Part
 from mcsim.datavector.summaries import Element
 from mcsim.ensemble.external_maps import in_uk, parts_of
 from mcsim.ensemble.maps import POINTING, file_names, first_realization
-from mcsim.errors import InputError
+from mcsim.errors import InputError, as_given
 from mcsim.simulation import simulate
 from mcsim.sphere import alm, healpix, map_files
 from mcsim.sphere.checks import UNSEEN_BELOW
@@ -186,12 +186,12 @@ def warn_of_parts_of_pixels(model: Model) -> None:
         weight = kept_mask(path, model.nside, model.frame, run.map.mask_frame)
         parts = int(np.sum((weight > 0.0) & (weight < 1.0)))
         if fine.size > weight.size and parts and np.isin(fine, (0.0, 1.0)).all():
-            warnings.warn(
+            said = (
                 f"{path} has nside {healpy.npix2nside(fine.size)} and hides a part of {parts} pixels of the maps, of "
                 f"nside {model.nside}; a diagnosis uses these as a whole, with what the mask hides of them, which a "
-                "mask of the maps' nside that is 0 there leaves out.",
-                stacklevel=3,
+                "mask of the maps' nside that is 0 there leaves out."
             )
+            warnings.warn(as_given(said), stacklevel=3)
 
 
 def check_subtracted(model: Model, given: Mapping[str, Map]) -> None:

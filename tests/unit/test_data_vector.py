@@ -283,11 +283,11 @@ def test_maps_with_the_dipole_of_the_sky_are_refused(analysis) -> None:
 def test_masks_that_hide_a_part_of_pixels_are_told_of(tmp_path) -> None:
     """Light of the Galaxy that a fine mask hides was diagnosed, in pixels at its edge, without a word."""
 
-    def of_mask(nside: int, weights: tuple[float, float]) -> list[str]:
+    def of_mask(nside: int, weights: tuple[float, float], given: bool = False) -> list[str]:
         z, path = healpy.pix2vec(nside, np.arange(12 * nside**2))[2], tmp_path / f"mask_{nside}.fits"
-        healpy.write_map(path, np.where(np.abs(z) > 0.21, *weights), dtype=np.float64, overwrite=True)
+        healpy.write_map(path, mask := np.where(np.abs(z) > 0.21, *weights), dtype=np.float64, overwrite=True)
         table = two_channels("hidden", lmax=16, period_s=997.0)
-        run = config.load(table | {"map": table["map"] | {"mask": str(path)}})
+        run = config.load(table | {"map": table["map"] | {"mask": mask if given else str(path)}})
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             warn_of_parts_of_pixels(model_of(survey(run), DiagnosisSettings()))
@@ -297,4 +297,6 @@ def test_masks_that_hide_a_part_of_pixels_are_told_of(tmp_path) -> None:
     share = healpy.ud_grade((np.abs(z) > 0.21).astype(float), 16)
     [sentence] = of_mask(64, (1.0, 0.0))
     assert not unnamed(sentence, "mask_64.fits", 64, 16, int(np.sum((share > 0.0) & (share < 1.0))))
+    [other] = of_mask(64, (1.0, 0.0), given=True)
+    assert other == sentence.replace(str(tmp_path / "mask_64.fits"), "the given mask")
     assert not of_mask(16, (1.0, 0.0)) + of_mask(8, (1.0, 0.0)) + of_mask(64, (1.0, 0.5))
