@@ -157,11 +157,12 @@ class Model:
         at high degrees. Of maps that show the sky beyond lmax it is that of their mean. None where an isotropic filter
         wastes little.
         """
-        if not _wastes(self.parts, self.sky_power, self.bright, self.settings):
+        over_masks = [part.precision * mask**2 for part, mask in zip(self.parts, self.masks, strict=True)]
+        if not (self.hides or _is_uneven(over_masks, self.sky_power, self.bright, self.settings)):
             return None
         parts, templates = [], templates_of(self.survey.preparations)
-        for part, mask, own in zip(self.parts, self.masks, templates, strict=True):
-            precision = part.precision * mask**2 / self.white[part.channel]
+        for part, mask, own, over_mask in zip(self.parts, self.masks, templates, over_masks, strict=True):
+            precision = over_mask / self.white[part.channel]
             subtracted = () if own is None else ((divided(own, mask), precision),)
             parts.append(replace(part, precision=precision, subtracted=subtracted))
         noise, white = (divided(1.0, self._weight(rows)) for rows in (self.colours, self.white[:, None]))
@@ -258,7 +259,8 @@ def model_of(survey: Survey, settings: DiagnosisSettings) -> Model:
     cl, snr = survey.cl[: lmax + 1], snr[: lmax + 1]
     response, colours = response[:, : lmax + 1], colours[:, : lmax + 1]
     known, inverse, sky_power = pixels and not bright and bool(snr[lmax] <= SHARP), None, snr / (1.0 + snr)
-    if known and _wastes(parts, sky_power, bright, settings):
+    uneven = known and _is_uneven([part.precision for part in parts], sky_power, bright, settings)
+    if known and (uneven or hidden_share(parts) >= settings.hidden_share):
         parts = list(marginalised(survey, parts))
         inverse = inverse_of(cl, response, parts)
     maps = survey.nside, cl, response, tuple(parts), dipole_alm(survey.channels[0].site.dipole_uk, lmax)
@@ -283,17 +285,15 @@ def hidden_share(parts: Sequence[Part]) -> float:
     return max(float(np.mean(part.precision == 0.0)) for part in parts)
 
 
-def _wastes(parts: Sequence[Part], sky_power: Cl, bright: bool, settings: DiagnosisSettings) -> bool:
-    """Return True if an isotropic filter wastes much: maps lack a part of the sky, or have very uneven noise.
+def _is_uneven(precisions: Sequence[Map], sky_power: Cl, bright: bool, settings: DiagnosisSettings) -> bool:
+    """Return True if maps have so uneven noise, of these inverse variances, that an isotropic filter wastes much.
 
     It takes the noise for the mean variance everywhere; what maps tell of the largest scales follows the mean of the
     inverse. Where the sky is far above the noise, or is seen beyond lmax, the inverse covariance takes it for noise,
     and tells less of a full sky than the isotropic filter.
     """
-    if hidden_share(parts) >= settings.hidden_share:
-        return True
-    seen = (part.precision[part.precision > 0.0] for part in parts)
-    uneven = max(float(np.mean(1.0 / one) * np.mean(one)) for one in seen)
+    seen = (precision[precision > 0.0] for precision in precisions)
+    uneven = max((float(np.mean(1.0 / one) * np.mean(one)) for one in seen if one.size), default=1.0)
     return not bright and bool(sky_power[-1] <= SHARP / (1.0 + SHARP)) and uneven > settings.uneven_noise
 
 

@@ -215,6 +215,20 @@ def test_a_full_sky_far_above_very_uneven_noise_is_found_by_the_isotropic_filter
     assert cross > share * alm_.power(own, model.lmax)[last].sum()
 
 
+def test_soft_edges_of_a_mask_are_no_uneven_noise(tmp_path):
+    """What a mask multiplies noise with, it multiplies the sky with."""
+    run = uneven()
+    even = tuple(replace(one, noise=replace(one.noise, hits=None)) for one in run.channels)
+    weight = np.where(np.abs(HEIGHT) > 0.9, 0.1, 1.0)
+    np.save(tmp_path / "soft.npy", weight)
+    for channels, expected in ((even, False), (run.channels, True)):
+        soft = replace(run, channels=channels, preparation=(Mask(mask=str(tmp_path / "soft.npy")),))
+        model = modelled(soft)
+        precision = model.parts[0].precision
+        assert np.mean(1.0 / precision) * np.mean(precision) > model.settings.uneven_noise
+        assert (model.unmasked is not None) == expected
+
+
 def test_maps_that_keep_the_isotropic_filter(run):
     """Where the sky is far above the noise at the last degree it is found with more noise, by another model."""
     assert modelled(replace(run, map=replace(run.map, mask=None, mask_frame=None))).inverse is None  # the full sky
