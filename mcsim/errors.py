@@ -8,11 +8,6 @@ _GIVEN = re.compile(
 """File of the cache that holds what a user gave as an array or object; its name is that of the key or object."""
 
 
-def as_given(message: str) -> str:
-    """Return a message that names what was given as an array, not its file."""
-    return _GIVEN.sub(r"the given \1", message)
-
-
 class InputError(ValueError):
     """Input that mcsim cannot use.
 
@@ -33,7 +28,7 @@ class InputError(ValueError):
 
     def __init__(self, message: str) -> None:
         """Make one line of what a library said of a broken file; name what was given as an array, not its file."""
-        super().__init__(as_given(" ".join(message.split()) if "\n" in message else message))
+        super().__init__(_GIVEN.sub(r"the given \1", " ".join(message.split()) if "\n" in message else message))
 
 
 class RunError(RuntimeError):

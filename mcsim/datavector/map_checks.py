@@ -15,7 +15,7 @@ from mcsim.datavector.parts import Part
 from mcsim.datavector.summaries import Element
 from mcsim.ensemble.external_maps import in_uk, parts_of
 from mcsim.ensemble.maps import POINTING, file_names, first_realization
-from mcsim.errors import InputError, as_given
+from mcsim.errors import InputError
 from mcsim.simulation import simulate
 from mcsim.sphere import alm, healpix, map_files
 from mcsim.sphere.checks import UNSEEN_BELOW
@@ -191,7 +191,7 @@ def warn_of_parts_of_pixels(model: Model) -> None:
                 f"nside {model.nside}; a diagnosis uses these as a whole, with what the mask hides of them, which a "
                 "mask of the maps' nside that is 0 there leaves out."
             )
-            warnings.warn(as_given(said), stacklevel=3)
+            warnings.warn(str(InputError(said)), stacklevel=3)  # as errors name what was given as an array
 
 
 def check_subtracted(model: Model, given: Mapping[str, Map]) -> None:
