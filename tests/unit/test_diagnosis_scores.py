@@ -18,7 +18,7 @@ from mcsim.datavector.shared_sky import shared_sky
 from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import ScanModel
-from mcsim.simulation import pixel_means, simulate
+from mcsim.simulation import pixel_means, simulate, windows
 from mcsim.simulation.pixel_means import Part, mean_gain
 from mcsim.simulation.survey import survey
 from mcsim.sphere import alm as alm_
@@ -249,5 +249,6 @@ def test_samples_that_stand_closer_leave_the_window_of_a_preparation() -> None:
     orders = np.zeros((len(model.parts), model.settings.beam_orders + 1, model.lmax + 1))
     orders[0, 0, lmax] = 1.0
     filtered: Any = SimpleNamespace(orders=orders)
-    change = healpix.pixel_window(32, lmax)[lmax] ** (0.9**2 - 1.0) - 1.0
+    window = healpix.pixel_window(32, 40)
+    change = windows.stretched(window, 32, 0.9)[lmax] / window[lmax] - 1.0
     assert closer(filtered) == pytest.approx(model.survey.channels[0].beam.blm[0, lmax].real * change, rel=1e-9)
