@@ -179,7 +179,8 @@ def _warn_of_nothing(effect: systematics.Effect, site: systematics.Site) -> None
     others = [hook for hook in HOOKS if hook not in ("gain", "noise")]
     if effect.scope != "channel" or effect.amplitude == 0.0 or systematics.acts_through(effect, *others):
         return
-    if effect.gain(np.zeros(1), site) is None and effect.noise(site) is None:
+    year = 86400.0 * np.arange(366.0)  # a gain may begin on some day
+    if effect.gain(year, site) is None and effect.noise(site) is None:
         warnings.warn(
             f"effect {effect.name} does nothing on channel {site.channel}: its hooks return None at amplitude = "
             f"{effect.amplitude:g}; if a return is missing, add it.",

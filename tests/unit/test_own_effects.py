@@ -98,6 +98,16 @@ def test_a_gain_whose_return_is_forgotten_is_told_of(tmp_path):
     assert unnamed(str(told[0].message), "forgotten", effect["channel"], 0.1) == []
 
 
+def test_a_gain_that_begins_on_some_day_is_no_forgotten_one(tmp_path):
+    late = FORGOTTEN.replace(
+        "self.amplitude * time_s", "return None if time_s.max() < 4e6 else self.amplitude * time_s"
+    )
+    (tmp_path / "late.py").write_text(late)
+    table = two_channels("own", lmax=12, nside=8, sigma0_uk=0.0, period_s=300.0)
+    effect = {"name": str(tmp_path / "late.py"), "channel": table["channel"][0]["name"], "amplitude": 0.1}
+    check_effects(config.load(table | {"effect": [effect]}))
+
+
 @pytest.mark.parametrize("kind", [BentGain, BentSignal, HighGain])
 def test_a_nuisance_acts_as_the_effect_that_is_drawn(kind):
     """One that is not linear in its amplitude, too, or that changes nothing in one channel."""
