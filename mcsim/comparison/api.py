@@ -19,7 +19,7 @@ from mcsim.comparison.prediction import PRECISION, Set
 from mcsim.comparison.result import UNMADE, ChannelResult, ComparisonResult, DifferenceResult, Verdict
 from mcsim.comparison.scene import Scene
 from mcsim.comparison.search import INTERPOLATING, Problem
-from mcsim.comparison.shown_sky import adds_orders, with_fewer_orders, with_shown_sky
+from mcsim.comparison.shown_sky import adds_orders, shown_skies, with_fewer_orders, with_shown_sky
 from mcsim.errors import InputError
 from mcsim.sphere import healpix
 from mcsim.sphere.checks import check_number
@@ -31,7 +31,10 @@ INTERPOLATION = 1e-3  #: the same for the interpolation of a sky between pixels 
 INTERPOLATED = 0.02  #: share of the variance that a width of the beam leaves at least of such an interpolation's error
 
 CLEARLY = 0.1
-"""Share of what a named set leaves that one of exchanged sides must leave at most to be named in its place."""
+"""Share of what a named set leaves that one of exchanged sides must leave at most to be named in its place.
+
+Of what single samples change: what a set may leave at most without them if side B has nothing of that.
+"""
 
 DOUBTFUL = 0.01
 """Share that a set that is named may leave, beyond which differences of the last stage are tried all the same."""
@@ -179,11 +182,25 @@ def _explained(
 
     Last comes the share of the variance that is left beyond what noise may hide.
     """
-    second = pair.turned != sides.of_b  # the model was taken for that of the other side first
     sky, _ = (_sky_rms(pair, side) for side in "AB")
     if _rms((pair.b - pair.a)[pair.seen]) <= ROUNDING * sky:
         return _result(pair, "identical"), None, 0.0
-    pair = with_shown_sky(pair).where_different(ROUNDING * sky)
+    by_moments, *by_samples = shown_skies(pair)
+    best = _explained_in(by_moments, others, sides, accuracy, sky)
+    for one in by_samples:
+        assert one.spread is not None
+        if best[0].left_rms_uk > CLEARLY * _rms(one.spread[one.seen]):
+            found = _explained_in(one, others, sides, accuracy, sky)
+            best = min(best, found, key=lambda way: (way[0].verdict == "unknown", way[0].left_rms_uk))
+    return best
+
+
+def _explained_in(
+    pair: ChannelPair, others: Sequence[ChannelPair], sides: Comparison, accuracy: float, sky: float
+) -> tuple[ChannelResult, Problem | None, float]:
+    """Return the same of a pair as its side A was made; ``sky``: rms of side A, uK."""
+    second = pair.turned != sides.of_b  # the model was taken for that of the other side first
+    pair = pair.where_different(ROUNDING * sky)
     rms = _rms((pair.b - pair.a)[pair.seen])
     if rms <= ROUNDING * sky:
         return _result(pair, "identical"), None, 0.0

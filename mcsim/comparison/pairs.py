@@ -31,7 +31,7 @@ from mcsim.simulation.channels import with_all_orders
 from mcsim.simulation.noise import of_map
 from mcsim.simulation.survey import Channel, Survey, survey
 from mcsim.sphere import alm as alm_
-from mcsim.sphere import header, map_files
+from mcsim.sphere import header, healpix, map_files
 from mcsim.sphere.checks import UNSEEN_BELOW, check_map, check_not_infinite
 from mcsim.support import resources
 from mcsim.support.arrays import Alm, Map, reals
@@ -298,7 +298,7 @@ def _external(own: config.RunConfig, given: str, nthreads: int) -> dict[str, Map
 
 
 def _closer(made: dict[str, Map], wanted: dict[str, Map], side: str | Path, nthreads: int) -> dict[str, Map]:
-    """Return the maps of a run as they were made, or those that are closer to the other side's, but for a factor.
+    """Return the maps of a run as they were made, or closer ones, but for a factor, a monopole and a dipole.
 
     Orientation moments spread samples over their pixels otherwise than another simulator does, which may have all
     orders of a beam too: these are taken where they are clearly closer, for beside another difference chance decides.
@@ -319,9 +319,10 @@ def _closer(made: dict[str, Map], wanted: dict[str, Map], side: str | Path, nthr
             there = wanted[name]
             if there.size == maps[name].size:
                 both = (maps[name] > UNSEEN_BELOW) & (there > UNSEEN_BELOW) & np.isfinite(there)
-                here, there = maps[name][both], there[both]
-                factor = float(here @ there) / max(float(here @ here), 1e-300)
-                total += float(np.sum((factor * here - there) ** 2))
+                axes = healpix.centres(healpy.npix2nside(there.size))
+                free = np.vstack([maps[name], np.ones(there.size), axes])[:, both].T
+                rest = there[both] - free @ np.linalg.lstsq(free, there[both], rcond=None)[0]
+                total += float(rest @ rest)
         return total
 
     best = min(own, key=distance)

@@ -29,12 +29,20 @@ ROUNDS = 2  #: how often the sky is corrected for what its simulation leaves of 
 
 
 def with_shown_sky(pair: ChannelPair) -> ChannelPair:
-    """Return a pair whose sky, if it is taken from side A, makes its maps sample by sample, but for their noise."""
+    """Return a pair whose sky, if it is taken from side A, makes its maps as they were made, but for their noise."""
+    return shown_skies(pair)[0]
+
+
+def shown_skies(pair: ChannelPair) -> list[ChannelPair]:
+    """Return a pair with the sky that side A shows; if moments made A, also with what single samples change in it.
+
+    Which of the two side B is like, what explains the difference must say: that alone may be like single samples.
+    """
     if pair.scene is None:
-        return pair
-    found = _as_made(pair, _sharper(pair) if pair.sky_of_maps else pair)
-    weight = _weight(found) if pair.sky_of_maps else None
-    return found if weight is None else _filtered(found, weight)
+        return [pair]
+    ways = _as_made(pair, _sharper(pair) if pair.sky_of_maps else pair)
+    weights = [_weight(one) if pair.sky_of_maps else None for one in ways]
+    return [one if own is None else _filtered(one, own) for one, own in zip(ways, weights, strict=True)]
 
 
 def with_fewer_orders(pair: ChannelPair) -> tuple[ChannelPair, ChannelPair | None]:
@@ -118,18 +126,19 @@ def _sky(pair: ChannelPair) -> float:
     return float(np.var(pair.a[pair.seen]) * pair.seen.sum())
 
 
-def _as_made(pair: ChannelPair, found: ChannelPair) -> ChannelPair:
+def _as_made(pair: ChannelPair, found: ChannelPair) -> list[ChannelPair]:
     """Return a pair as side A was made: by single samples, orientation moments, or at the pixels' centres.
 
-    ``found`` has the sky of single samples, ``pair`` that of orientation moments. If side A was made from moments and
-    side B from single samples, what those change is added to side A; else they are not simulated.
+    ``found`` has the sky of single samples, ``pair`` that of orientation moments. If side A was made from moments, no
+    single samples are simulated. Side B may be made of these all the same: then comes the pair with what they change
+    added to side A.
     """
     scene = pair.scene
     assert scene is not None
     assert found.scene is not None
     left = float(np.sum(_missing(found)[found.seen] ** 2))
     if left <= UNSHOWN**2 * _sky(pair):
-        return found
+        return [found]
     best = scene
     if _left(pair, scene.maps()) > SHARP**2 * _sky(pair):
         centred = [scene.at_centres(), replace(scene.at_centres(), beam=scene.beam.truncated(0))]
@@ -137,12 +146,12 @@ def _as_made(pair: ChannelPair, found: ChannelPair) -> ChannelPair:
             centred = [replace(one, sky=sky_in(pair.a, pair.shown, one)) for one in centred]
         best = min([scene, *centred], key=lambda one: _left(pair, one.maps()))
     if _left(pair, best.maps()) > MADE * left:
-        return found
+        return [found]
+    ways = [replace(pair, scene=best, by_moments=True, unmade=None)]
     if best is scene and pair.pointing() is not None:
         spread = np.where(pair.seen, _made(pair, scene) - scene.maps(), 0.0)
-        if np.sum(spread * np.where(pair.seen, pair.b - pair.a, 0.0)) > 0.5 * np.sum(spread**2):
-            return replace(pair, a=pair.a + spread, spread=spread, unmade=None)
-    return replace(pair, scene=best, by_moments=True, unmade=None)
+        ways.append(replace(pair, a=pair.a + spread, spread=spread, unmade=None))
+    return ways
 
 
 def _made(pair: ChannelPair, scene: Scene) -> Maps:

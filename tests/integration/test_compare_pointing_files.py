@@ -56,3 +56,16 @@ def test_a_side_that_is_a_configuration_has_no_noise(folder):
     np.testing.assert_array_equal(noisy.a, quiet.a)
     [both] = pairs.read(folder / "noisy.toml", folder / "model.toml").pairs
     assert not both.noise_uk.any()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_monopole_does_not_choose_how_a_configuration_is_simulated(folder, sign, tmp_path):
+    """It is like what single samples change, whose mean is not zero."""
+    run = folder / "model.toml"
+    [made] = mcsim.write_maps(run, tmp_path, realizations=0)
+    map_ = healpy.read_map(made / "X.fits", dtype=np.float64)
+    shifted = np.where(map_ > -1e20, map_ + sign * 1000.0, map_)
+    healpy.write_map(made / "X.fits", shifted, dtype=np.float64, column_units="uK", coord="E", overwrite=True)
+    found = mcsim.compare(run, made)
+    assert [d.name for d in found.channels[0].differences] == ["monopole"]
+    assert found.channels[0].left_rms_uk < 1e-3

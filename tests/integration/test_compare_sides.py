@@ -150,6 +150,26 @@ def test_a_side_that_was_made_from_orientation_moments_is_recognised(both, simul
         assert mcsim.compare(list(of_moments[0]), side_a, simulator.run).accuracy < 1e-5
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_large_monopole_is_not_taken_for_what_single_samples_change(sign, simulator):
+    """Their mean is not zero, so that a monopole is like them to the rms of the difference."""
+    side_a = simulate.maps(survey(simulator.run), 0, sky=simulator.sky)
+    found = mcsim.compare(list(side_a), [m + sign * 1000.0 for m in side_a], simulator.run)
+    assert names(found) == ["monopole"]
+    assert found.channels[0].left_rms_uk < 1e-9
+    assert found.channels[0].spread_rms_uk == 0.0
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_what_single_samples_change_is_seen_beside_a_large_monopole(sign, simulator, side_a):
+    of_moments = simulate.maps(survey(simulator.run), 0, sky=simulator.sky)
+    side_b = [np.where(m > -1e20, m + sign * 1000.0, m) for m in side_a]
+    found = mcsim.compare(list(of_moments), side_b, simulator.run)
+    assert names(found) == ["monopole"]
+    assert found.channels[0].left_rms_uk < 1e-3
+    assert found.channels[0].spread_rms_uk > 0.1
+
+
 def test_maps_at_the_centres_of_pixels_are_recognised(simulator):
     """Maps of a pipeline without a scan: one through the pixel window, one without it."""
     run = replace(simulator.run, map=replace(simulator.run.map, splits=()))
