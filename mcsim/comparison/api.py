@@ -189,10 +189,20 @@ def _explained(
     best = _explained_in(by_moments, others, sides, accuracy, sky)
     for one in by_samples:
         assert one.spread is not None
-        if best[0].left_rms_uk > CLEARLY * _rms(one.spread[one.seen]):
+        change = _rms(one.spread[one.seen])
+        if best[0].left_rms_uk > CLEARLY * change:
             found = _explained_in(one, others, sides, accuracy, sky)
-            best = min(best, found, key=lambda way: (way[0].verdict == "unknown", way[0].left_rms_uk))
+            if _has_change(change, *(way[0] for way in (best, found))):
+                best = found
     return best
+
+
+def _has_change(change: float, without: ChannelResult, found: ChannelResult) -> bool:
+    """Return True if a pair with a change in side A, uK rms, is explained so much better that side B must have it."""
+    if "unknown" in (without.verdict, found.verdict) and without.verdict != found.verdict:
+        return without.verdict == "unknown"
+    less = without.left_rms_uk**2 - found.left_rms_uk**2
+    return less > 0.5 * change**2 or found.left_rms_uk < CLEARLY * without.left_rms_uk
 
 
 def _explained_in(

@@ -25,6 +25,7 @@ from mcsim.comparison.scene_differences import (
     PsiOffset,
     PsiSign,
     Smoothing,
+    SmoothingWithDipole,
     SpinSign,
     TimeShift,
 )
@@ -37,7 +38,7 @@ def library(frame: str) -> tuple[Difference, ...]:
         Unit(), Calibration(), Monopole(), Dipole(), Ordering(), FrameReversed(), SplitExchanged(), ChannelExchanged(),
         NoiseShared(),
         PsiOffset(), PsiSign(), BeamConjugated(), MmaxCut(), LmaxCut(), PixelWindow(), BeamWindow(), Smoothing(),
-        PixelCentres(), PixelAverage(),
+        SmoothingWithDipole(), PixelCentres(), PixelAverage(),
         TimeShift(), FrameRotated(frame), SpinSign(), PrecessionSign(),
         FarTimeShift(), MapMaking(), Interpolation(),
     )  # fmt: skip

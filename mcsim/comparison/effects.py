@@ -37,22 +37,24 @@ BEAM_STAGES = ("beam", "pointing", "spread", "orientations")  #: where an effect
 class EffectDifference(Difference):
     """An effect of the library, linear in its coordinates.
 
-    The response of one that acts on beam or pointing is not larger than the sky: templates are those of small
-    amplitudes. Others, and a gain, are bounded as in a diagnosis.
+    The response of one that acts on beam or pointing is not larger than the sky and the dipole that it changes:
+    templates are those of small amplitudes. Others, and a gain, are bounded as in a diagnosis.
     """
 
     proportional = True
     natural = 1e-9
     stage = 1
 
-    def __init__(self, kind: type[Effect], templates: Maps, run: config.RunConfig, sky: Alm) -> None:
+    def __init__(
+        self, kind: type[Effect], templates: Maps, run: config.RunConfig, sky: Alm, dipole_uk: float = 0.0
+    ) -> None:
         self.kind, self.templates, self.run, self.sky = kind, templates, run, sky
         self.name, self.unit, self.met = kind.name, kind.unit, kind.cause
         self.linear = kind.name != GAIN
         self._there: dict[tuple[Any, ...], Maps] = {}  # by what the templates depend on
         self._products = np.tensordot(templates, templates, ((1, 2), (1, 2))) / templates[0].size
         power = healpy.alm2cl(sky)
-        self._largest = float((2 * np.arange(power.size) + 1) @ power) / (4.0 * np.pi)
+        self._largest = float((2 * np.arange(power.size) + 1) @ power) / (4.0 * np.pi) + dipole_uk**2 / 3.0
 
     def starts(self, state: State) -> list[Vector]:
         return [self.within(state.fit(list(self.templates)))]
@@ -170,8 +172,9 @@ class EffectDifference(Difference):
 
 def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDifference]:
     """Yield the effects to which the noise-free maps of a channel respond, with their templates per coordinate."""
-    if pair.scene is None:
+    if pair.scene is None or pair.channel is None:
         return
+    dipole_uk = float(np.linalg.norm(pair.channel.site.dipole_uk))
     alone = quiet(run.of_channels(pair.name))
     scene = pair.scene
 
@@ -193,7 +196,7 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
         # Orientations of the scan itself, say, respond by rounding alone, which an amplitude of 1e11 would fit.
         changes = [np.abs(t).max() * _scale(kind, effect) for t, effect in zip(templates, basis_of(kind), strict=True)]
         if max(changes) > ROUNDING * np.std(bare[pair.seen]):
-            yield EffectDifference(kind, np.stack(templates), alone, scene.sky)
+            yield EffectDifference(kind, np.stack(templates), alone, scene.sky, dipole_uk)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,6 +24,7 @@ from mcsim.simulation.channels import NEGLECTED
 from mcsim.sphere import alm as alm_
 from mcsim.sphere import healpix
 from mcsim.sphere.rotation import FRAMES, rotation_matrix, turn_alm
+from mcsim.sphere.sky import dipole_alm
 from mcsim.support.arrays import Vector
 
 _SMALL = 1e-3  #: small angle in radians, share of a sample, or change of a variance, over which responses are linear
@@ -329,6 +330,25 @@ class Smoothing(Difference):
 
     def parameters(self, value: Vector) -> dict[str, float | str]:
         return {"by": "a circular Gaussian"}
+
+
+class SmoothingWithDipole(Smoothing):
+    """The same of a sky with the dipole of the model, which both sides subtract as the beam of side A sees it."""
+
+    met = "a beam of another width than the one through which the dipole is subtracted"
+
+    def starts(self, state: State) -> list[Vector]:
+        channel = state.pair.channel
+        return super().starts(state) if channel is not None and channel.site.dipole_uk.any() else []
+
+    def scene(self, scene: Scene, value: Vector, pair: ChannelPair) -> Scene:
+        assert pair.channel is not None
+        dipole = dipole_alm(pair.channel.site.dipole_uk, scene.lmax)
+        smoothed = super().scene(replace(scene, sky=scene.sky + dipole), value, pair)
+        return replace(smoothed, sky=smoothed.sky - dipole)
+
+    def parameters(self, value: Vector) -> dict[str, float | str]:
+        return {**super().parameters(value), "of": "the sky and its dipole"}
 
 
 def _variance(scene: Scene) -> float:
