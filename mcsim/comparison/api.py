@@ -14,11 +14,12 @@ from mcsim.comparison import report
 from mcsim.comparison.catalogue import library
 from mcsim.comparison.effects import effects_of
 from mcsim.comparison.looks import look
+from mcsim.comparison.output import REPORT, RESULT, check_output
 from mcsim.comparison.pairs import ChannelPair, Comparison, Given, given, read
 from mcsim.comparison.prediction import PRECISION, Set
 from mcsim.comparison.result import UNMADE, ChannelResult, ComparisonResult, DifferenceResult, Verdict
 from mcsim.comparison.scene import Scene
-from mcsim.comparison.search import INTERPOLATING, Problem
+from mcsim.comparison.search import INTERPOLATED, INTERPOLATING, Problem
 from mcsim.comparison.shown_sky import adds_orders, shown_skies, with_fewer_orders, with_shown_sky
 from mcsim.errors import InputError
 from mcsim.sphere import healpix
@@ -28,7 +29,6 @@ from mcsim.support.progress import reporting
 
 ROUNDING = 1e-6  #: rms of a difference over that of the sky that single precision makes
 INTERPOLATION = 1e-3  #: the same for the interpolation of a sky between pixels or grid points
-INTERPOLATED = 0.02  #: share of the variance that a width of the beam leaves at least of such an interpolation's error
 
 CLEARLY = 0.1
 """Share of what a named set leaves that one of exchanged sides must leave at most to be named in its place.
@@ -69,7 +69,7 @@ def compare(
         Without one, only differences of the maps themselves are tried: units, calibration, monopole, dipole, order of
         the pixels, exchanged files.
     output
-        Folder for ``compare.json`` and ``report.html``; None: nothing is written.
+        Folder for ``compare.json`` and ``report.html``, in place of those of the same case; None: nothing is written.
     accuracy
         Rms of a difference over that of the sky up to which maps that differ in no known way are called identical.
     quiet
@@ -117,8 +117,9 @@ def compare(
         output = folders.user_path(output)
         folders.writable(output)
     if isinstance(a, str | Path) and isinstance(b, str | Path):
-        sides = read(a, b, model, nthreads)
         case = Path(b).absolute().name
+        check_output(output, (a, b), case)
+        sides = read(a, b, model, nthreads)
     elif isinstance(a, str | Path) or isinstance(b, str | Path):
         raise InputError("one side is a folder and the other arrays; give two folders or two lists of maps.")
     else:
@@ -127,7 +128,9 @@ def compare(
                 "sides that are no paths are maps of which nothing is known; give the model whose maps they are."
             )
         run = model if isinstance(model, config.RunConfig) else config.load(model)
-        sides, case = given(a, b, run, nthreads), run.name
+        case = run.name
+        check_output(output, (), case)
+        sides = given(a, b, run, nthreads)
     found = []
     with reporting("channels compared", float(len(sides.pairs)), "channels", quiet) as progress:
         for number, pair in enumerate(sides.pairs):
@@ -136,9 +139,9 @@ def compare(
     result = ComparisonResult(case, tuple(found), sides.not_compared, sides.shown)
     if output is not None:
         text = json.dumps(result.to_dict(), indent=1, allow_nan=False) + "\n"
-        with folders.filling(target := Path(output)), folders.replacing(target, "compare.json") as scratch:
-            (scratch / "report.html").write_text(report.page(result), encoding="utf-8")
-            (scratch / "compare.json").write_text(text, encoding="utf-8")
+        with folders.filling(target := Path(output)), folders.replacing(target, RESULT) as scratch:
+            (scratch / REPORT).write_text(report.page(result), encoding="utf-8")
+            (scratch / RESULT).write_text(text, encoding="utf-8")
     return result
 
 
