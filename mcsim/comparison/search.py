@@ -52,6 +52,9 @@ ALIKE = 2.0  #: sets that leave at most so many times what the best one leaves a
 UNFITTED = 10.0  #: the same of sets with fewer fitted values, which explain as much as they do without them
 EQUAL = 1.1  #: the same for sets of which the one with the fewest fitted values is named, and of what noise hides
 
+INTERPOLATED = 0.02
+"""Share of the variance of an interpolation's error that a width of the beam, or another value, leaves at least."""
+
 INTERPOLATING = frozenset({"beam_width", "interpolation"})
 """What the interpolation of a sky does too: not named below the accuracy at which maps are called identical."""
 
@@ -286,10 +289,12 @@ class Problem(Prediction):
     def preferred(self, sets: Sequence[Set]) -> list[Set]:
         """Return sets with the best first; of those that are as good, the one with the fewest fitted values.
 
-        As good are sets of one size too that leave no more than an interpolation, which a fitted value may take in.
+        As good are sets of one size too that leave no more than an interpolation, of which a fitted value may take in
+        all but :data:`INTERPOLATED`.
         """
         limit = EQUAL * sets[0].left + UNSURE * self.hidden(sets[0]) + PRECISION
         little, size = min(ENOUGH, self.floor**2 * self.pair.seen.sum() / self.total), len(sets[0].members)
+        little = min(little, sets[0].left / INTERPOLATED)
         close = [one for one in sets if one.left <= (max(limit, little) if len(one.members) == size else limit)]
         equal = [one for one in close if self.suffices(one)]
         first = min(equal, key=lambda one: (len(one.members), one.fitted), default=sets[0])

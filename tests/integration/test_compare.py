@@ -14,7 +14,7 @@ from mcsim import config
 from mcsim.comparison import pairs
 from mcsim.comparison.description import with_known_offsets
 from mcsim.comparison.effects import effects_of
-from mcsim.comparison.map_differences import Calibration, Monopole
+from mcsim.comparison.map_differences import Calibration, Dipole, Monopole
 from mcsim.comparison.prediction import Set
 from mcsim.comparison.scene_differences import PixelWindow, Smoothing, TimeShift
 from mcsim.comparison.search import Problem
@@ -65,6 +65,16 @@ def test_what_interpolation_leaves_does_not_choose_a_name():
     for left, first in ((1e-4, window), (2e-3, width)):
         found = Problem(pair, (), 1e-3).preferred([Set((width, scale), 1e-5), larger, Set((window, scale), left)])
         assert found[0].members == (first, scale)
+
+
+def test_what_leaves_nothing_is_not_given_up_for_fewer_fitted_values():
+    """No value takes in all that an interpolation leaves: a pointing offset was a time constant, which is nearly it."""
+    draw = np.random.default_rng(1)
+    a, seen = draw.standard_normal((1, 12 * NSIDE**2)), np.ones((1, 12 * NSIDE**2), bool)
+    pair = pairs.ChannelPair("T", ("T",), a, a + 0.05 * draw.standard_normal(a.shape), seen)
+    dipole, width = (Dipole(), np.ones(3)), (Smoothing(), np.ones(1))
+    found = Problem(pair, (), 1e-3).preferred([Set((dipole,), 1e-12), Set((width,), 1e-5)])
+    assert found[0].members == (dipole,)
 
 
 def test_a_turn_of_a_degree_is_not_taken_for_a_turn_of_half_a_circle_more(simulator, side_a):
