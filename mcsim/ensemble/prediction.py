@@ -28,7 +28,7 @@ from mcsim.ensemble.expectation import (
 from mcsim.ensemble.tasks import packages, shared_survey
 from mcsim.simulation import power
 from mcsim.simulation.survey import Survey
-from mcsim.sphere.checks import check_whole
+from mcsim.sphere.checks import check_truth, check_whole
 from mcsim.stats.streaming import Sums
 from mcsim.support.arrays import divided
 
@@ -121,6 +121,8 @@ def predict(
     >>> float(expected.biposh_mean.sel(mode="L2M0d0", pair="demo,demo", ell=20).real) > 0.0
     True
     """
+    check_truth(exact, "exact")
+    check_truth(snr, "snr")
     if L_moments is not None:
         check_whole(L_moments, "L_moments", 1)
     check_whole(nthreads, "nthreads", 1)

@@ -27,6 +27,12 @@ def check_whole(value: Any, name: str, least: int = 0) -> None:
         raise InputError(f"{name} is {value!r}, but it must be a whole number (int) >= {least}.")
 
 
+def check_truth(value: Any, name: str) -> None:
+    """Raise InputError unless ``value`` is True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} is {value!r}, but it must be True or False.")
+
+
 def check_memory(size: float, what: str, remedy: str) -> None:
     """Raise InputError if ``size`` bytes are more than this machine's memory; ``what`` needs them."""
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

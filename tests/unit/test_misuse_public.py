@@ -219,6 +219,8 @@ def test_a_column_of_the_square_is_no_beam(column, tmp_path) -> None:
         (lambda: mcsim.predict(run(), L_moments=-1), ("L_moments", -1)),
         (lambda: mcsim.predict(run(), L_moments=2.5), ("L_moments", 2.5)),
         (lambda: mcsim.predict(run(), exact=True, L_moments=1), ("L_moments", 1, "biposh.L_max", 2)),
+        (lambda: mcsim.predict(run(), exact="x"), ("exact", "'x'", True, False)),
+        (lambda: mcsim.predict(run(), snr=1), ("snr", 1, True, False)),
         (lambda: mcsim.predict(run(), nthreads="2"), ("nthreads", "'2'")),
         (lambda: fit_models(None, None, "constant"), ("models", "'constant'")),
         (lambda: fit_models(None, None, None), ("models", None)),
