@@ -63,11 +63,13 @@ def pulls(fitted: ArrayLike, true: ArrayLike, errors: ArrayLike) -> tuple[float,
 
 
 def mean(name: str, values: Sequence[float] | Vector) -> Metric:
-    """Return the mean of at least two values, with its Student interval."""
+    """Return the mean of at least two values, with its Student interval of at least three: of two it says nothing."""
     n = len(values)
     if n < 2:
         return Metric(name, n)
     value = float(np.mean(values))
+    if n < 3:
+        return Metric(name, n, value)
     low, high = value + stats.sem(values) * stats.t.ppf((0.025, 0.975), n - 1)
     return Metric(name, n, value, float(low), float(high))
 

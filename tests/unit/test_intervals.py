@@ -26,6 +26,14 @@ def test_too_few_cases_meet_no_target():
     assert intervals.share("x", [True] * 18 + [False]).within("", 0.95).met is False
 
 
+def test_the_mean_of_two_values_has_no_interval():
+    """Student's is 13 standard deviations wide, and says nothing."""
+    two, three = intervals.mean("x", [0.5, 1.5]), intervals.mean("x", [0.5, 1.0, 1.5])
+    assert (two.value, two.count) == (1.0, 2)
+    assert np.isnan([two.low, two.high]).all()
+    assert three.low < 1.0 < three.high
+
+
 def test_a_value_is_near_a_target_that_its_interval_reaches():
     few, many = (intervals.share("x", [True] * 9 * n + [False] * n).within("", 0.95) for n in (2, 200))
     assert [(one.met, one.near) for one in (few, many)] == [(False, True), (False, False)]
