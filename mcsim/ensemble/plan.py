@@ -164,6 +164,7 @@ def attributes(run: config.RunConfig) -> dict[str, Any]:
 def check_same(path: Path, run: config.RunConfig) -> None:
     """Raise InputError, with the keys that differ, unless a store has this configuration and its variables."""
     if changes := _changes(store.attributes(path), attributes(run)):
+        check_effects(run)  # a file of effects that is broken is another configuration too, and says more
         raise InputError(
             f"{path} was made with another configuration ({'; '.join(changes)}); "
             "choose another store with -o, or restore the values."

@@ -10,6 +10,8 @@ import pytest
 import mcsim
 from instruments import two_channels
 from mcsim import config, systematics
+from mcsim.ensemble import store
+from mcsim.ensemble.plan import attributes, check_store, layout
 from mcsim.simulation import simulate
 from mcsim.simulation.channels import check_effects
 from mcsim.simulation.nuisance import DisturbedSurvey, tables
@@ -106,6 +108,20 @@ def test_a_gain_that_begins_on_some_day_is_no_forgotten_one(tmp_path):
     table = two_channels("own", lmax=12, nside=8, sigma0_uk=0.0, period_s=300.0)
     effect = {"name": str(tmp_path / "late.py"), "channel": table["channel"][0]["name"], "amplitude": 0.1}
     check_effects(config.load(table | {"effect": [effect]}))
+
+
+def test_a_broken_file_of_effects_is_said_before_another_configuration(tmp_path):
+    """Its content is a part of the configuration, and was all that was said."""
+    own = tmp_path / "own.py"
+    own.write_text(FORGOTTEN.replace("self.amplitude *", "return self.amplitude *"))
+    table = two_channels("own", lmax=12, nside=8, sigma0_uk=0.0, period_s=300.0)
+    run = table | {"effect": [{"name": str(own), "channel": table["channel"][0]["name"], "amplitude": 0.1}]}
+    loaded = config.load(run)
+    store.create(tmp_path / "own.zarr", layout(survey(loaded)), attributes(loaded))
+    check_store(tmp_path / "own.zarr", loaded, resume=False)
+    own.write_text("import no_such_module\n" + own.read_text())
+    with refused("no_such_module", own):
+        check_store(tmp_path / "own.zarr", config.load(run), resume=False)
 
 
 @pytest.mark.parametrize("kind", [BentGain, BentSignal, HighGain])
