@@ -160,7 +160,7 @@ def discard(path: Path, damage: Damage) -> None:
 
 
 def absent_files(path: Path, summary: bool | None = None) -> list[str]:
-    """Return the files of finished realizations, coordinates and summary that are not there; read none of them.
+    """Return the files of finished realizations, coordinates and summary that are not there, or empty; read none.
 
     ``summary``: True for those of the summary alone, False for all others.
     """
@@ -177,13 +177,16 @@ def absent_files(path: Path, summary: bool | None = None) -> list[str]:
             for index in metadata.chunk_grid.all_chunk_coords(shape):
                 if not by_row or finished[index[0] * long : (index[0] + 1) * long].any():
                     wanted.append(f"{name}/{metadata.encode_chunk_key(index)}")
-    return [file for file in wanted if not (path / file).is_file()]
+    return [file for file in wanted if not (path / file).is_file() or (path / file).stat().st_size == 0]
 
 
 def check_whole(path: Path, summary: bool | None = None) -> None:
-    """Raise RunError if there are :func:`absent_files`: zarr reads them as fill values, without a word."""
+    """Raise RunError if there are :func:`absent_files`: zarr reads them as fill values, without a word.
+
+    Files that a power cut has left are empty. What else is damaged only a reading of all files finds.
+    """
     if absent := absent_files(path, summary):
-        some = f"{len(absent)} of its files, {absent[0]} among them"
+        some = f"{len(absent)} of its files, {absent[0]} among them, or they are empty"
         raise RunError(f"{path} lacks {some}; mcsim run --resume makes them again.")
 
 

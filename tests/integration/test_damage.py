@@ -166,6 +166,13 @@ def test_a_finished_store_that_lacks_files_is_not_finished(part: str, copy: Path
         runner.run(table(), copy)
 
 
+@pytest.mark.parametrize("part", ["biposh/c/1/0/0/0", "cl/c/0/0/0", "summary/cl_mean/zarr.json"])
+def test_a_finished_store_with_files_that_a_power_cut_left_empty_is_not_finished(part: str, copy: Path) -> None:
+    (copy / part).write_bytes(b"")
+    with refused(part, "--resume", by=RunError):
+        runner.run(table(), copy)
+
+
 BINNED = "summary/biposh_difference_binned_mean/c/0/0/0"
 
 
