@@ -1,6 +1,7 @@
 """Skies that users give, as files of a_lm or of maps, refused in one sentence where they cannot be used."""
 
 import warnings
+from functools import cache
 from pathlib import Path
 
 import healpy
@@ -18,20 +19,39 @@ from mcsim.support.npy import read_npy
 
 LARGEST_UK = 1e7  #: of a user's sky: 10 K, more than the Galaxy has in any band of a CMB survey
 
+UNLIKE = 30.0  #: between the largest coefficients of skies of one run from which on one is in another unit: mK are 1000
+
 SMALLEST_UK, SMALL_UK = 0.01, 1.0
 """Of the largest value of a user's sky that is not zero: a CMB sky in K has 5e-4, in mK 0.5, and in uK more than 1."""
 
 
 def given(run: config.RunConfig, realization: int) -> Alm | None:
-    """Return the sky of a realization that a run reads from files, a_lm up to the sky's lmax, uK; None: it draws it."""
-    sky, frame = run.sky, run.map.frame
+    """Return the sky of a realization that a run reads from files, a_lm up to the sky's lmax, uK; None: it draws it.
+
+    InputError if the file cannot be used, or is in another unit than that of realization 0, as far as sizes say.
+    """
+    template = run.sky.map if run.sky.alm is None else run.sky.alm
+    if template is None:
+        return None
     channels = {channel.frequency_ghz for channel in run.channels}
     frequency = channels.pop() if len(channels) == 1 else None
-    if sky.alm is not None:
-        return read_alm(config.sky_path(sky.alm, realization), sky.lmax, frame, frequency_ghz=frequency)
-    if sky.map is None:
-        return None
-    return read_map(config.sky_path(sky.map, realization), sky.lmax, frame, frequency_ghz=frequency)
+    of_maps, grid = run.sky.alm is None, (run.sky.lmax, run.map.frame, frequency)
+    path, first = (config.sky_path(template, r) for r in (realization, 0))
+    found, unit = (_map_and_unit if of_maps else _alm_and_unit)(path, *grid)
+    if path != first and not unit and path.suffix != ".npy" and first.is_file():
+        size, usual = float(np.abs(found).max()), _size(first, first.stat().st_mtime_ns, of_maps, *grid)
+        if size * usual > 0.0 and not 1.0 / UNLIKE < size / usual < UNLIKE:
+            raise InputError(
+                f"{path} has a_lm of up to {size:.3g} uK, {first} of up to {usual:.3g} uK; is one of them in another "
+                "unit? Say it in its header (TUNIT), or give both in uK."
+            )
+    return found
+
+
+@cache
+def _size(path: Path, time_ns: int, of_maps: bool, lmax: int, frame: str, frequency_ghz: float | None) -> float:
+    """Return the largest coefficient of a sky that was written at some time, in absolute value, uK."""
+    return float(np.abs((_map_and_unit if of_maps else _alm_and_unit)(path, lmax, frame, frequency_ghz)[0]).max())
 
 
 def read_alm(path: Path, lmax: int, frame: str, frequency_ghz: float | None = None) -> Alm:
@@ -40,6 +60,10 @@ def read_alm(path: Path, lmax: int, frame: str, frequency_ghz: float | None = No
     ``frequency_ghz`` is as in :func:`read_map`. InputError if the file cannot be read, ends below ``lmax``, states
     another frame or a unit that cannot be converted, or has values that are not finite or of no sky in uK.
     """
+    return _alm_and_unit(path, lmax, frame, frequency_ghz)[0]
+
+
+def _alm_and_unit(path: Path, lmax: int, frame: str, frequency_ghz: float | None) -> tuple[Alm, str | None]:
     if path.suffix == ".npy":
         given = read_npy(path, "c")
         mmax, keywords = healpy.Alm.getlmax(given.size), fits.Header()
@@ -57,8 +81,9 @@ def read_alm(path: Path, lmax: int, frame: str, frequency_ghz: float | None = No
         raise InputError(f"{path} is in {stated} coordinates, the run's maps in {frame}; rotate the sky first.")
     factor = header.to_uk(str(keywords.get("TUNIT2", "")), path, frequency_ghz)
     alm = alm if factor == 1.0 else factor * alm
-    _check_size(path, alm, keywords.get("TUNIT2"))
-    return alm_.resize(alm, found, lmax)
+    unit = keywords.get("TUNIT2")
+    _check_size(path, alm, unit)
+    return alm_.resize(alm, found, lmax), unit
 
 
 def read_map(path: Path, lmax: int, frame: str, frequency_ghz: float | None = None) -> Alm:
@@ -67,6 +92,10 @@ def read_map(path: Path, lmax: int, frame: str, frequency_ghz: float | None = No
     ``frame`` is the run's, and the file's where it states one; ``frequency_ghz`` is what the run's channels have in
     common: antenna temperature and brightness need it. InputError if the file cannot be used so.
     """
+    return _map_and_unit(path, lmax, frame, frequency_ghz)[0]
+
+
+def _map_and_unit(path: Path, lmax: int, frame: str, frequency_ghz: float | None) -> tuple[Alm, str | None]:
     map_uk, stated = map_files.read_uk_and_unit(path, frame, frequency_ghz)
     nside = healpy.npix2nside(map_uk.size)
     if nside & (nside - 1):
@@ -76,7 +105,7 @@ def read_map(path: Path, lmax: int, frame: str, frequency_ghz: float | None = No
     if lmax > 3 * nside - 1:
         raise InputError(f"{path} has nside {nside}, good to l = {3 * nside - 1}; the sky's lmax {lmax} is above it.")
     _check_size(path, map_uk, stated)
-    return healpix.analysis(map_uk, lmax, iterations=3)
+    return healpix.analysis(map_uk, lmax, iterations=3), stated
 
 
 def _check_size(path: Path, sky: NDArray[np.generic], unit: str | None) -> None:
