@@ -389,7 +389,7 @@ class NoiseShared(Difference):
         Of sqrt(1 - c^2) own + c other, less own, the share that fits is (1 + c - sqrt(1 - c^2))/2.
         """
         twice = np.clip(2.0 * value[0] - 1.0, -np.sqrt(2.0), 1.0)
-        return float(twice + np.sqrt(2.0 - twice**2)) / 2.0
+        return float(twice + np.sqrt(max(2.0 - twice**2, 0.0))) / 2.0
 
     def found(self, value: Vector) -> str:
         return "in side A"

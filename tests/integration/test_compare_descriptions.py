@@ -482,3 +482,9 @@ def test_late_samples_add_no_dipole_to_an_effect():
         made.append(np.where(pair.seen, ellipse.sampled(np.array([0.1, 0.0]), late, pair), 0.0))
     assert made[0].std() > 0.1
     assert np.abs(made[1] - made[0]).max() < 1.0
+
+
+@pytest.mark.parametrize(("share", "correlation"), [(0.5, np.sqrt(0.5)), (1.0, 1.0), (0.0, 0.0), (-5.0, -np.sqrt(0.5))])
+def test_a_share_of_noise_is_a_correlation(share, correlation):
+    """The least share, (1 - sqrt 2)/2, is beyond what rounding leaves of a root: it was nan."""
+    assert NoiseShared().amplitude(np.array([share, 0.0])) == pytest.approx(correlation)
