@@ -213,7 +213,7 @@ class Pixelization(Effect):
     -----
     The pixel window and the gradient along the mean offset, which the fiducial model has, go with them. A gap of this
     kind lies in the model and not in the instrument: data made of samples at the centres, or the other way round.
-    Beyond 2 the samples would stand outside of their pixels.
+    Above 2 the samples would stand outside of their pixels. Below 0 they do, as in pixels larger than the model's.
     """
 
     name = "pixelization"
@@ -224,7 +224,7 @@ class Pixelization(Effect):
     signature = "Small scales, depending on nside, and the gradient of the sky at pixels that are hit unevenly."
     source = "Gorski et al. 2005, ApJ 622, 759 (HEALPix); the HEALPix Primer (pixel window functions)"
     step = 0.1
-    bounds = (Bound("amplitude", -2.0, 2.0, "beyond it samples stand outside of their pixels"),)
+    bounds = (Bound("amplitude", -2.0, 2.0, "above it samples stand outside of their pixels, below it far outside"),)
     parametrization = Parametrization(max_amplitude=2.0)
 
     def spread(self) -> float:
