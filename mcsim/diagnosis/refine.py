@@ -25,6 +25,7 @@ it makes of noise and of the part of the sky that is not known, and what is like
 the difference of the two then."""
 
 MOVED = 0.1  #: share of coordinates by which they move from which on what they scatter is drawn anew
+BENT = 1.5  #: by which a bend may be larger than it is told, of other skies and at an amplitude that it makes too small
 TOGETHER = 3  #: members of the largest sets that are simulated where nothing else explains the data
 NEARLY = 0.8  #: share of what the best single candidate explains, from which on others are tried that explain less
 
@@ -229,7 +230,7 @@ class Refiner:
             if self.data.dipole_snr([there]) > settings.nonlinear_sigma:
                 return True
         bend = self._bend(list(candidate.columns), coordinates)
-        allowed = (bend + 2.0) ** 2 + 2.0 * np.log(settings.odds_cut)
+        allowed = (BENT * bend + 2.0) ** 2 + 2.0 * np.log(settings.odds_cut)
         return bend > settings.nonlinear_sigma and fit.chi2 - one.fit.chi2 <= allowed
 
     def _simulate_in_place(self, now: _Responses, others: tuple[int, ...], index: int) -> bool:

@@ -163,15 +163,24 @@ def test_a_rival_is_simulated_at_its_amplitude_though_another_is_named():
     assert {one.members for one in found.explanations} == {(0,), (2,)}
 
 
-@pytest.mark.parametrize(("beside", "members"), [(0.0, {(0,), (2,)}), (13.0, {(2,)})])
+@pytest.mark.parametrize(("beside", "members"), [(0.0, {(0,), (2,)}), (20.0, {(2,)})])
 def test_what_is_like_a_name_is_simulated_where_its_response_bends(beside, members):
-    """C has the response of A at its amplitude. Beside it A leaves 9^2, which its bend of 9 can be, or 9^2 + 13^2."""
+    """C has the response of A at its amplitude. Beside it A leaves 9^2, which its bend of 9 can be, or 9^2 + 20^2."""
     instrument = Instrument(bend=0.04, cross=0.0)
     x = instrument.response(15.0, 0.0) + beside * instrument.t[:, 1]
     instrument.t[:, 2] = x / np.linalg.norm(x)
     found = instrument.refined(x).attribution
     assert {one.members for one in found.explanations} == members
     assert any("A" in tables for tables in instrument.analysis) == ((0,) in members)
+
+
+def test_what_is_like_a_name_is_simulated_where_its_bend_is_told_a_fifth_too_small():
+    """It is that of other skies: of a calibration of S/N 113 it was 54 in place of 58, and a ring was named alone."""
+    instrument = Instrument(bend=0.0125, cross=0.0)
+    instrument.curvature *= 0.8
+    x = instrument.response(60.0, 0.0)
+    instrument.t[:, 2] = x / np.linalg.norm(x)
+    assert {one.members for one in instrument.refined(x).attribution.explanations} == {(0,), (2,)}
 
 
 @pytest.mark.parametrize(("crossed", "members"), [("A", {(0,), (2,)}), ("B", {(2,)})])
