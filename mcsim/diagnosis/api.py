@@ -203,7 +203,8 @@ def describe(
     elif done := sum(len(held.found(job)) for job in jobs):
         lines.append(f"  cache   has {done} of these simulations")
     lines.append(
-        "if the data depart from the model: hundreds more simulations, of effects that are fitted to them, and thousands where many act"
+        "if the data depart from the model: hundreds more simulations, of effects that are fitted to them, "
+        "and thousands where many act"
     )
     if source is None and table is None:
         more = simulated_scores.SIMULATIONS
