@@ -24,7 +24,12 @@ def digest(arrays: Iterable[NDArray[np.float64]]) -> str:
 
 
 def check_outside(folder: Path, data: Any) -> None:
-    """Raise InputError for an output that is the folder of the data."""
+    """Raise InputError for an output that is the folder of the data, or has the report of a comparison."""
+    if (folder / "compare.json").is_file():
+        raise InputError(
+            f"{folder} holds the report.html of a comparison (compare.json), which would be replaced; choose another "
+            "folder with -o."
+        )
     if not isinstance(data, str | Path) or not folder.is_dir():
         return
     if (maps := user_path(data)).is_dir() and folder.samefile(maps):

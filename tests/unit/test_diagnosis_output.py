@@ -25,6 +25,12 @@ def test_the_folder_of_the_data_is_refused(tmp_path: Path) -> None:
     check_outside(tmp_path / "new", tmp_path)
 
 
+def test_the_report_of_a_comparison_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "compare.json").write_text("{}")
+    with refused(tmp_path, "report.html", "-o"):
+        check_outside(tmp_path, MAPS)
+
+
 def test_a_verdict_is_replaced_by_one_of_its_own_case_and_data_alone(tmp_path: Path) -> None:
     check_replaced(tmp_path, "first", digest(MAPS))
     found = diagnosis("none")
