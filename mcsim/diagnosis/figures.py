@@ -83,7 +83,7 @@ def candidates_figure(result: DiagnosisResult) -> Figure:
         axes.annotate(p_equals(row.pvalue), (row.significance, place), **beside)
     axes.set_yticks(range(len(rows)), _labels([row.label for row in rows], WHOLE), fontsize=8)
     axes.set_ylim(len(rows) - 0.4, -0.6)
-    axes.set_xlim(0.0, 1.17 * max([row.significance for row in rows], default=0.0) or 1.0)
+    axes.set_xlim(0.0, 1.25 * max([row.significance for row in rows], default=0.0) or 1.0)
     shown = [
         ("blue: best set", BLUE),
         ("amber: an alternative", AMBER),
