@@ -75,7 +75,7 @@ class Spectrum(Effect):
     scope = "common"
     unit = "fraction of C_l"
     title = "power spectrum of the sky"
-    wording = Wording("{} of C_ℓ (norm over bands)", " %", 100.0)
+    wording = Wording("{} of C_ℓ", " %", 100.0)
     cause = "A cosmology that is not the one of the simulations."
     signature = "L = 0, every channel alike."
     source = "Follows from the definition"
@@ -86,6 +86,15 @@ class Spectrum(Effect):
     parametrization = _Bands(parameter="bands", count=BANDS, mean_response=True, matched_filter=False)
 
     bands: tuple[float, ...] = (1.0,) * BANDS
+
+    def direction(self) -> str:
+        """Say which band has more or less, if one alone changes."""
+        changed = np.flatnonzero(self.bands)
+        if len(changed) != 1:
+            return "(norm over bands)"
+        band = int(changed[0])
+        more = self.amplitude * self.bands[band] > 0.0
+        return f"{'more' if more else 'less'}, in band {band + 1} of {BANDS}"
 
     def sky(self, sky: Alm, site: Site, draw: Draw) -> Alm:
         """Rescale the bands by the square roots of their changes in power."""

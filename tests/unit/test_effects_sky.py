@@ -148,6 +148,21 @@ def test_spectrum_rescales_its_bands(site, sky):
         systematics.get("spectrum")(amplitude=2.0, bands=(-1.0, 0.0, 0.0, 0.0, 0.0, 0.0)).sky(sky, site, draw)
 
 
+@pytest.mark.parametrize(
+    ("bands", "said"),
+    [
+        ((0.0, -2.0, 0.0, 0.0, 0.0, 0.0), "less, in band 2 of 6"),
+        ((0.5, 0.0, 0.0, 0.0, 0.0, 0.0), "more, in band 1 of 6"),
+    ],
+)
+def test_spectrum_says_which_band_alone_changes(bands, said):
+    assert systematics.get("spectrum")(amplitude=0.08, bands=bands).describe(0.04) == f"8 % ± 4 % of C_ℓ {said}"
+
+
+def test_spectrum_of_several_bands_has_the_norm_of_their_changes():
+    assert systematics.get("spectrum")(amplitude=0.08).describe(0.04) == "8 % ± 4 % of C_ℓ (norm over bands)"
+
+
 def test_spectrum_nearest_to_less_than_no_power_leaves_some():
     """Of two correlated bands the other one makes up for what the first cannot be."""
     kind = systematics.get("spectrum")
