@@ -1,6 +1,7 @@
 """The hooks by which an effect acts, and what those of a user's effect may return."""
 
 import functools
+import inspect
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from types import TracebackType
@@ -16,6 +17,8 @@ HOOKS = (
     *("sky", "beam", "pointing", "gain", "steady_gain", "signal", "noise", "knee", "excess"),
     *("spread", "orientations", "differencing", "moved", "lags"),
 )
+
+_OTHERS = ("__post_init__", "variants_in", "format_amplitude", "direction", "inverse")  #: that a class may define, too
 
 _RETURNED = {
     "sky": "one complex coefficient for each of the sky",
@@ -61,6 +64,28 @@ def guard(kind: type) -> None:
     for hook in HOOKS:
         if hook in vars(kind):
             setattr(kind, hook, _guarded(hook, vars(kind)[hook]))
+    for name in _OTHERS:
+        own = vars(kind).get(name)
+        if isinstance(own, classmethod):
+            setattr(kind, name, classmethod(_telling(kind, name, own.__func__)))
+        elif inspect.isfunction(own):
+            setattr(kind, name, _telling(kind, name, own))
+
+
+def _telling(kind: type, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(function)
+    def call(*given: Any, **named: Any) -> Any:
+        try:
+            return function(*given, **named)
+        except InputError:
+            raise
+        except (Exception, SystemExit) as error:  # whatever a user's code does
+            title = getattr(kind, "name", kind.__name__)
+            raised = "let it raise mcsim.InputError for what cannot be, or "
+            remedy = f"{raised if name == '__post_init__' else ''}mend it"
+            raise HookError(f"effect {title}: its {name} fails ({type(error).__name__}: {error}); {remedy}.") from error
+
+    return call
 
 
 def _guarded(hook: str, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -103,6 +128,8 @@ def _flaw(hook: str, found: Any, given: Sequence[Any]) -> str | None:
     if hook in _OBJECTS:
         return None if isinstance(found, _OBJECTS[hook]) else f"a {type(found).__name__}"
     values = np.asarray(found)
+    if values.dtype.kind not in "bciuf":
+        return f"values of type {values.dtype}"
     if not np.all(np.isfinite(values)):
         return "values that are not finite"
     wanted = _shape(hook, values, given)

@@ -48,9 +48,9 @@ def catalogue() -> Library:
     for entry in entry_points(group=ENTRY_POINTS):
         try:
             kind = entry.load()
-        except Exception as error:  # whatever a foreign package does when it is imported
+        except (Exception, SystemExit) as error:  # whatever a foreign package does when it is imported
             raise InputError(
-                f"effect {entry.name} of {entry.value} cannot be loaded ({error}); mend or uninstall it."
+                f"effect {entry.name} of {entry.value} cannot be loaded ({_said(error)}); mend or uninstall it."
             ) from error
         if not (isinstance(kind, type) and issubclass(kind, Effect)):
             raise InputError(f"effect {entry.name} of {entry.value} is no class derived from mcsim.systematics.Effect.")
@@ -96,8 +96,13 @@ def _flaw(kind: type[Effect]) -> str | None:
     for key, value, largest in (("step", step, float_info.max), ("max_amplitude", fit.max_amplitude, inf)):
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= largest:
             return f"has {key} = {value!r}: it needs a number above 0"
+    if taken := sorted(f.name for f in fields(kind) if callable(getattr(Effect, f.name, None))):
+        return f"has the parameter {taken[0]}, which is a method of every effect: it needs another name"
+    bounds: Any = kind.bounds
+    if not isinstance(bounds, tuple | list):
+        return f"has bounds = {bounds!r}: it needs a tuple of mcsim.systematics.Bound"
     bounded = {f.name for f in fields(kind) if isinstance(f.default, int | float)}
-    for one in kind.bounds:
+    for one in bounds:
         if not isinstance(one, Bound) or one.parameter not in bounded or not one.low < one.high:
             return f"has the bound {one!r}: it needs a mcsim.systematics.Bound of a parameter, a number, low < high"
     if fit.sign not in (-1, 0, 1):
@@ -107,6 +112,7 @@ def _flaw(kind: type[Effect]) -> str | None:
         sizes = {fit.coordinates(effect).shape for effect in basis}
         for variant in kind.variants:
             build(kind, variant)
+        kind.format_amplitude(kind.step)
     except Exception as error:  # whatever a foreign class does
         return f"cannot be made ({type(error).__name__}: {error})"
     if not basis or sizes != {(len(basis),)}:
@@ -172,8 +178,8 @@ def in_file(path: str) -> tuple[type[Effect], ...]:
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (folder, os.environ.get("PYTHONPATH"))))
     try:
         module = import_module(file.stem)
-    except Exception as error:  # whatever a foreign file does when it is run
-        raise InputError(f"{path} cannot be run ({error}); mend it.") from error
+    except (Exception, SystemExit) as error:  # whatever a foreign file does when it is run
+        raise InputError(f"{path} cannot be run ({_said(error)}); mend it.") from error
     if _path_of(module) != file:
         raise InputError(f"{path} has the name of another module, {_path_of(module)}; rename it.")
     setattr(module, _EFFECTS, (content, ()))  # of a file that is refused below: once mended, it is run again
@@ -187,6 +193,11 @@ def in_file(path: str) -> tuple[type[Effect], ...]:
             raise InputError(f"the effect {kind.__name__} of {path} {flaw}; mend it.")
     setattr(module, _EFFECTS, (content, found))
     return found
+
+
+def _said(error: BaseException) -> str:
+    """Return what an error says: that which ends a program has a number at most."""
+    return f"{type(error).__name__}: {error}" if isinstance(error, SystemExit) else str(error)
 
 
 def _path_of(module: ModuleType) -> Path:

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from mcsim.systematics import registry
+
 REMOVED = object()
 DIFFERENCING = {"kind": "differencing", "model": "wmap_focal_plane", "pair": "W1"}
 
@@ -54,6 +56,14 @@ def cache(tmp_path, monkeypatch) -> Path:
     monkeypatch.setenv("MCSIM_CACHE", str(tmp_path / "cache"))
     (tmp_path / "cache").mkdir()
     return tmp_path / "cache"
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Register entry points in place of what is installed."""
+    registry.catalogue.cache_clear()
+    yield lambda *entries: monkeypatch.setattr(registry, "entry_points", lambda group: entries)
+    registry.catalogue.cache_clear()
 
 
 def changed(plain: dict, key: str, value: object) -> dict:

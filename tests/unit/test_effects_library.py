@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mcsim import systematics
+from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.instrument.scan import Moments, ScanModel
 from mcsim.sphere import alm as alm_
@@ -198,14 +199,6 @@ class Foreign(systematics.Effect):
         return 1.0 - self.amplitude
 
 
-@pytest.fixture
-def registered(monkeypatch):
-    """Register entry points in place of what is installed."""
-    registry.catalogue.cache_clear()
-    yield lambda *entries: monkeypatch.setattr(registry, "entry_points", lambda group: entries)
-    registry.catalogue.cache_clear()
-
-
 def test_packages_add_effects(registered):
     class Entry(EntryPoint):
         def load(self):
@@ -272,6 +265,10 @@ def test_an_effect_that_says_itself_how_it_is_fitted_is_refused(key):
             whole(bounds=(systematics.Bound("band", 0.0, 1.0, "a test"),), band="V", __annotations__={"band": str}),
             "band",
         ),
+        (whole(bounds=3.0), "bounds"),
+        (whole(wording="{} K"), "AttributeError"),
+        (whole(format_amplitude=lambda amplitude: 1 / 0), "format_amplitude"),
+        (whole(inverse=0.0, __annotations__={"inverse": float}), "inverse"),
         (whole(parametrization=Angle(parameter="no_such")), "no_such"),
         (whole(parametrization=Doubled()), "coordinates"),
         (whole(spread=None), "orientations"),
@@ -287,6 +284,58 @@ def test_an_effect_that_is_not_whole_is_refused_when_it_is_loaded(kind, key, reg
     registered(Entry("foreign", "package:Thing", registry.ENTRY_POINTS))
     with refused(key):
         systematics.catalogue()
+
+
+def test_a_package_that_ends_the_program_is_named(registered):
+    """The command ended without a word, with the exit code of the package."""
+
+    class Entry(EntryPoint):
+        def load(self):
+            raise SystemExit(4)
+
+    registered(Entry("foreign", "package:Thing", registry.ENTRY_POINTS))
+    with refused("foreign", "package:Thing", "SystemExit: 4"):
+        systematics.catalogue()
+
+
+def test_a_file_that_ends_the_program_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.path", list(sys.path))
+    monkeypatch.setenv("PYTHONPATH", "")
+    path = tmp_path / "ending_effect.py"
+    path.write_text("raise SystemExit(4)\n")
+    with refused(path, "SystemExit: 4"):
+        systematics.get(str(path))
+
+
+@pytest.mark.parametrize("error", [ValueError("too large"), SystemExit(5)])
+def test_an_effect_that_cannot_be_made_with_some_values_says_so(error):
+    """At the amplitude of a run it ended in a traceback, or without a word."""
+
+    def small(self):
+        if self.amplitude > 1.0:
+            raise error
+
+    kind = whole(__post_init__=small)
+    assert systematics.build(kind, {"amplitude": 1.0}).amplitude == 1.0
+    with refused("foreign", "__post_init__", type(error).__name__, "mcsim.InputError", by=systematics.HookError):
+        systematics.build(kind, {"amplitude": 2.0})
+
+
+def test_what_an_effect_refuses_itself_is_said_as_it_is():
+    def small(self):
+        if self.amplitude > 1.0:
+            raise InputError("an amplitude above 1 is too large; give less.")
+
+    with pytest.raises(InputError) as said:
+        systematics.build(whole(__post_init__=small), {"amplitude": 2.0})
+    assert str(said.value) == "an amplitude above 1 is too large; give less."
+
+
+def test_variants_that_fail_are_named():
+    kind = whole(variants_in=classmethod(lambda cls, splits: ({"split": splits[0]},)))
+    assert kind.variants_in(("a", "b")) == ({"split": "a"},)
+    with refused("foreign", "variants_in", "IndexError", by=systematics.HookError):
+        kind.variants_in(())
 
 
 @pytest.mark.parametrize(
@@ -313,9 +362,11 @@ def test_a_hook_that_fails_says_which(gain, named, site):
         ("signal", None, ("None", "times")),
         ("noise", np.ones(3), ("(3,)", "(768,)")),
         ("noise", 1.1, ("()", "(768,)")),
+        ("gain", np.zeros(5, dtype=object), ("object", "real")),
         ("knee", None, ("None", "frequency")),
         ("excess", None, ("None", "counts")),
         ("spread", None, ("None", "number")),
+        ("spread", "half", ("<U4", "number")),
         ("orientations", None, ("None", "mcsim.Moments")),
         ("differencing", None, ("None", "imbalance")),
         ("moved", (np.zeros(5), np.zeros(5)), ("(2, 5)", "(3, 5)")),
