@@ -29,6 +29,7 @@ from mcsim.sphere import rng
 from mcsim.support.arrays import Vector
 from mcsim.support.folders import appearing, user_path, writable
 from mcsim.support.progress import reporting
+from mcsim.systematics import HookError
 
 SMALLER = 0.7  #: factor between one trial of an amplitude and the next
 
@@ -140,6 +141,8 @@ def _measured(model: LearnedModel, member: Member, seed: int) -> Member:
         effect = candidate.effect(**parameters)
         try:
             strength = model.expected_snr(candidate.table(effect))
+        except HookError:
+            raise
         except InputError:
             continue
         if strength > STRONGER * member.strength and attempt + 1 < ATTEMPTS:

@@ -20,12 +20,13 @@ from mcsim.diagnosis.api import kept, prepared
 from mcsim.diagnosis.context import DiagnosisContext, context
 from mcsim.diagnosis.subsets import Subsets
 from mcsim.ensemble.runner import Workers
-from mcsim.errors import InputError, RunError
+from mcsim.errors import RunError
 from mcsim.sphere import rng
 from mcsim.stats.excess import HeldOut
 from mcsim.stats.gaussian import Fit, SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration
 from mcsim.support.arrays import Matrix, Vector, divided
+from mcsim.systematics import if_possible
 
 SKIES = 6  #: skies that an expected S/N is the mean of
 
@@ -103,10 +104,9 @@ class LinearModel(EffectsLibrary):
             effects = effects_at(self.candidates, members, frozen)
             return np.asarray(t @ coordinates_of(self.candidates, members, effects))
 
-        try:
+        with if_possible():
             return replace(self.halves, x=x).reduction(t, respond)
-        except InputError:
-            return None
+        return None
 
 
 def linear_model(known: DiagnosisContext, without: Sequence[str] = (), fresh: Matrix | None = None) -> LinearModel:

@@ -12,14 +12,13 @@ from mcsim.comparison.description import STAGES, quiet
 from mcsim.comparison.differences import Difference, State
 from mcsim.comparison.pairs import ChannelPair
 from mcsim.comparison.scene import Maps, Scene
-from mcsim.errors import InputError
 from mcsim.instrument.beams import Beam
 from mcsim.simulation import sampled, simulate
 from mcsim.simulation.channels import table_of
 from mcsim.simulation.survey import Survey, survey
 from mcsim.sphere import alm as alm_
 from mcsim.support.arrays import Alm, Vector
-from mcsim.systematics import Effect, acts_through, described
+from mcsim.systematics import Effect, acts_through, described, if_possible
 from mcsim.systematics.registry import basis_of, catalogue
 
 REDUNDANT = ("monopole_residual", "pixelization", "spectrum")
@@ -85,19 +84,17 @@ class EffectDifference(Difference):
         key = scene.beam.blm.tobytes(), scene.window.tobytes(), (late, turn, scene.psi[0], scene.centred), periods
         if key not in self._there:
             basis = basis_of(self.kind)
-            try:
+            made = self.templates
+            with if_possible():  # it may need more orders than moments of another motion have
                 made = np.stack([self._response(effect, scene, pair) / _scale(self.kind, effect) for effect in basis])
-            except InputError:  # more orders than moments of another motion have
-                made = self.templates
             self._there[key] = np.where(pair.seen, made, 0.0)
         return self._there[key]
 
     def response(self, value: Vector, scene: Scene, pair: ChannelPair) -> Maps | None:
         """Return the effect's response on a scene; None if it cannot be so large."""
-        try:
+        with if_possible():
             return self._response(self._effect(value), scene, pair)
-        except InputError:
-            return None
+        return None
 
     def _response(self, effect: Effect, scene: Scene, pair: ChannelPair) -> Maps:
         beam = scene.displaced_beam
@@ -122,9 +119,10 @@ class EffectDifference(Difference):
             return np.stack([m for _, m in sampled.maps(whole, 0, scene.nthreads)])
 
         alone, acting = self._runs(self._effect(value), scene, pair, scene.beam)
-        try:
+        more = None
+        with if_possible():
             more = made(acting)
-        except InputError:
+        if more is None:
             return None
         if alone.sky.dipole_uk:  # which a scene has not, and late samples see elsewhere
             return more - made(alone)
@@ -186,12 +184,12 @@ def effects_of(pair: ChannelPair, run: config.RunConfig) -> Iterator[EffectDiffe
         redundant = name in REDUNDANT or (name == GAIN and not run.sky.dipole_uk)
         if kind.parametrization.stochastic or redundant or not kind.proposed or not acts_through(kind, *STAGES):
             continue
-        templates = []
-        try:
-            for effect in basis_of(kind):
-                acting = replace(alone, effects=(table_of(effect, pair.name if effect.scope == "channel" else None),))
-                templates.append(np.where(pair.seen, (made(acting) - bare) / _scale(kind, effect), 0.0))
-        except InputError:  # it depends on what the model does not say: a frequency, a pointing, a differencing scan
+        templates, channel = None, pair.name if kind.scope == "channel" else None
+        with if_possible():  # it may depend on what the model does not say: a frequency, a pointing
+            acting = [replace(alone, effects=(table_of(effect, channel),)) for effect in basis_of(kind)]
+            changes = [(made(one) - bare) / _scale(kind, of) for one, of in zip(acting, basis_of(kind), strict=True)]
+            templates = [np.where(pair.seen, change, 0.0) for change in changes]
+        if templates is None:
             continue
         # Orientations of the scan itself, say, respond by rounding alone, which an amplitude of 1e11 would fit.
         changes = [np.abs(t).max() * _scale(kind, effect) for t, effect in zip(templates, basis_of(kind), strict=True)]

@@ -35,6 +35,7 @@ from mcsim.sphere import header, healpix, map_files
 from mcsim.sphere.checks import UNSEEN_BELOW, check_map, check_not_infinite
 from mcsim.support import resources
 from mcsim.support.arrays import Alm, Map, reals
+from mcsim.systematics import if_possible
 from mcsim.systematics.base import Pointing
 
 Given = Sequence[Map] | Mapping[str, Map]
@@ -336,10 +337,9 @@ def _by_samples(run: config.RunConfig, nthreads: int) -> dict[str, Map] | None:
     pointings = [channel.site.pointing for channel in whole.making.channels]
     if any(p is None or p.model.samples(p.line) > SAMPLES for p in pointings):
         return maps_of_files(whole, HELD, nthreads)
-    try:
+    with if_possible():  # not with an effect on orientation moments, say
         return dict(sampled.maps(whole, 0, nthreads))
-    except InputError:  # an effect on orientation moments, say
-        return None
+    return None
 
 
 def _folder(folder: Path, run: config.RunConfig | None, described: str) -> dict[str, Map]:

@@ -1,18 +1,15 @@
 """Test if mcsim's own simulation of a model agrees with that of somebody else."""
 
-from contextlib import suppress
-
 import numpy as np
 from scipy.stats import ks_2samp
 
 from mcsim.datavector.candidate import lost, parts_of
 from mcsim.diagnosis.context import DiagnosisContext
 from mcsim.diagnosis.result import Agreement
-from mcsim.errors import InputError
 from mcsim.stats.gaussian import SimulatedGaussian
 from mcsim.stats.look_elsewhere import global_test
 from mcsim.support.arrays import Vector
-from mcsim.systematics import described
+from mcsim.systematics import described, if_possible
 
 
 def agreement(known: DiagnosisContext) -> Agreement:
@@ -57,7 +54,7 @@ def _nearest(known: DiagnosisContext, null: SimulatedGaussian, there: Vector) ->
     pvalues = null.nested_test(np.maximum(falls, 0.0), chi2, [len(one.columns) for one in candidates])
     best = int(np.lexsort((-np.array(falls), pvalues))[0])
     ((_, theta, covariance),) = parts_of(candidates, (best,), fits[best])
-    with suppress(InputError):
+    with if_possible():
         # From responses to small steps: without an error, which a large one has beyond that of the noise.
         about = described(candidates[best].fitted(theta, covariance), known.frame)
         return f"{candidates[best].title} (about {about})"

@@ -15,12 +15,11 @@ from mcsim.diagnosis.partial import PartialExplanation
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.result import DiagnosisResult
 from mcsim.diagnosis.selection import Explanation
-from mcsim.errors import InputError
 from mcsim.stats.detection import cosines, detectable, snr_needed, snr_to_separate
 from mcsim.stats.excess import HeldOut, excess_of
 from mcsim.stats.gaussian import Fit
 from mcsim.support.arrays import Matrix, Vector
-from mcsim.systematics import described
+from mcsim.systematics import described, if_possible
 
 TELLING = 12  #: elements that are named where two sets differ
 
@@ -198,12 +197,11 @@ def _candidates(data: DataSet, refined: Refined, correlation: Matrix) -> Iterato
     rank = null.whiten_groups(t, [one.columns for one in candidates]).sizes
     for k, candidate in enumerate(candidates):
         columns = list(candidate.columns)
-        try:
+        amplitude, sigma, words = float("nan"), float("nan"), "no such amplitude"
+        with if_possible():
             fit = with_priors(null, t[:, columns], found.singles[k], [candidate])
             (alone,) = effects_of(candidates, (k,), fit, data.context.frame)
             amplitude, sigma, words = alone.amplitude, alone.sigma, alone.words
-        except InputError:
-            amplitude, sigma, words = float("nan"), float("nan"), "no such amplitude"
         typical, fixed = candidate.typical, candidate.fixed
         at = "".join(f" at {name.replace('_', ' ')} {value:g}" for name, value in fixed.items())
         reach, size = detectable(known, straight[:, columns], tests, typical), None

@@ -7,11 +7,11 @@ import numpy as np
 from mcsim.datavector.campaign import with_effects
 from mcsim.datavector.candidate import Candidate, parts_of
 from mcsim.diagnosis.context import DiagnosisContext
-from mcsim.errors import InputError
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 from mcsim.stats.gaussian import Fit
 from mcsim.support.numbers import measured
+from mcsim.systematics import if_possible
 
 PATTERNS = 12  #: patterns that are drawn to measure it
 
@@ -34,9 +34,10 @@ def as_seen(context: DiagnosisContext, members: Sequence[int], found: Fit) -> It
         candidate = context.candidates[member]
         if not is_drawn(candidate):
             continue
-        try:
+        table = None
+        with if_possible():
             table = candidate.table(candidate.detected(theta, covariance))
-        except InputError:
+        if table is None:
             continue
         runs = (with_effects(analysis.run, [table]), analysis.run)
         with_it, without = (survey(run, library=dict(analysis.library)) for run in runs)

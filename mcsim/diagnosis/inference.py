@@ -209,9 +209,10 @@ def _alone(data: DataSet, member: int, theta: Vector, covariance: Matrix) -> Mat
     candidate = data.context.candidates[member]
     if candidate.parametrization.stochastic:
         return None
-    try:
+    table = None
+    with if_possible():
         table = candidate.table(candidate.detected(theta, covariance))
-    except InputError:
+    if table is None:
         return None
     before, _ = data.pair_extended([table], data.context.settings.scatter_skies)
     return data.scatter(before[:, : len(data.x)])

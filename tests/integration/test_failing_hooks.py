@@ -82,3 +82,16 @@ def test_a_hook_that_fails_in_any_simulation_of_a_diagnosis_ends_it(known):
 def test_a_hook_that_fails_at_the_fitted_amplitude_ends_the_diagnosis(known):
     with refused("wider", "ZeroDivisionError", by=HookError):
         diagnose_data(ObservedMaps(known, observed(beam_width=0.6), ask), "wide")
+
+
+def test_an_amplitude_that_cannot_be_said_ends_the_diagnosis(known, monkeypatch):
+    """It was an amplitude that cannot be, in the list of candidates."""
+
+    def failing(kind, amplitude, sigma=0.0):
+        if sigma:
+            raise HookError("effect wider: its format_amplitude fails")
+        return "some"
+
+    monkeypatch.setattr(Wider, "format_amplitude", classmethod(failing))
+    with refused("wider", "format_amplitude", by=HookError):
+        diagnose_data(ObservedMaps(known, observed(noise_level=0.4), ask), "loud")
