@@ -130,7 +130,7 @@ def _code(parts: tuple[Part, ...], label: str, made: bytes, given: Any) -> Code:
     None: that copy is from a module.
     """
     simulator = _loaded(made).simulator
-    method, effects = _method(simulator), getattr(simulator, "effects", None) or ()
+    method, effects = _method(simulator), _said_by(simulator, "effects", label) or ()
     listed = isinstance(effects, Iterable) and not isinstance(effects, str)
     if not listed or not all(isinstance(name, str) for name in effects):
         raise InputError(f"{label}.effects = {effects!r} is no list of names; give those of effects that it can add.")
@@ -138,15 +138,25 @@ def _code(parts: tuple[Part, ...], label: str, made: bytes, given: Any) -> Code:
     if not takes or (effects and "effects" not in takes):
         missing = "effects" if takes else "seed"
         raise InputError(f"simulate of {label} has no argument {missing}; define simulate(seed, effects=()).")
-    return Code(parts, label, tuple(effects), "sky" in takes, made, _content(simulator, given))
+    content = _content(simulator, given, _said_by(simulator, "state", label))
+    return Code(parts, label, tuple(dict.fromkeys(effects)), "sky" in takes, made, content)
 
 
-def _content(simulator: Any, given: Any) -> str:
+def _said_by(simulator: Any, name: str, label: str) -> Any:
+    """Return an attribute by which a simulator says something of itself; None: it has none."""
+    try:
+        return getattr(simulator, name)
+    except (Exception, SystemExit) as error:  # whatever a foreign property does
+        if isinstance(error, AttributeError) and not hasattr(type(simulator), name):
+            return None
+        raise InputError(f"{label}.{name} fails ({type(error).__name__}: {error}); mend it.") from error
+
+
+def _content(simulator: Any, given: Any, state: Any) -> str:
     """Return a hash of the source code and of ``state``, or without one of everything that the object holds.
 
     What a class or module makes with the description holds no more than these: a part of what tells diagnoses apart.
     """
-    state = getattr(simulator, "state", None)
     if state is not None:
         return hash_of(class_digest(_definition(simulator if given is None else given)), repr(state))
     if given is None and not isinstance(simulator, partial):

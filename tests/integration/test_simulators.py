@@ -186,6 +186,24 @@ def test_what_a_simulator_says_of_effects():
             source_of(run, Plain(effects=effects))
 
 
+@pytest.mark.parametrize("name", ["effects", "state"])
+@pytest.mark.parametrize("error", [RuntimeError, AttributeError, SystemExit])
+def test_what_a_simulator_fails_to_say_of_itself_is_refused(name, error):
+    """It ended in a traceback; an AttributeError of a property was a simulator without effects."""
+
+    def fails(self):
+        raise error("of a user")
+
+    kind = type("Survey", (), {"simulate": lambda self, seed, effects=(): {}, name: property(fails)})
+    with refused(f"Survey.{name}", error.__name__):
+        source_of(config.load(MODEL), kind())
+
+
+def test_an_effect_that_is_declared_twice_is_one():
+    kind = type("Survey", (), {"simulate": lambda self, seed, effects=(): {}, "effects": ["beam_width", "beam_width"]})
+    assert source_of(config.load(MODEL), kind()).effects == ("beam_width",)
+
+
 def test_a_simulator_that_exits_fails_with_its_seed(tmp_path):
     def exits(seed):
         raise SystemExit("no licence")
