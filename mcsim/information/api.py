@@ -27,14 +27,16 @@ from mcsim.simulation.inverse_covariance import InverseCovariance, ObservedMap
 from mcsim.simulation.map_filter import unknown_dipole
 from mcsim.simulation.nuisance import nuisances_of
 from mcsim.simulation.preparation import keeps_pixels, templates_of
-from mcsim.simulation.survey import survey
+from mcsim.simulation.survey import Channel, survey
 from mcsim.support import folders, page
-from mcsim.support.arrays import divided
+from mcsim.support.arrays import Cl, Vector, divided
 from mcsim.support.numbers import duration
 from mcsim.support.progress import reporting
 from mcsim.support.settings import settings_of
 
 DOTS_PER_INCH = 100
+
+MOST = 3e6  #: rms of the sky over the noise of a pixel; at 3e7 sigma of a noise level is a sixth of what it is
 
 RESPONSE = 3.0  #: cost of a response over that of the circular maps of a sky, on average over the library
 
@@ -196,6 +198,8 @@ def inverse_covariance(
             "the limit is that of white noise in the pixels of maps, which [[preparation]] changes; leave out its "
             "steps but for templates and dipoles that are fitted and subtracted, and masks of zeros and ones."
         )
+    assert shared.cl is not None  # a model of the analysis has one
+    cl = unknown_dipole(shared.cl, settings.unknown_dipole_uk)
     made = [(channel, m) for channel in shared.channels for m in channel.maps]
     maps = []
     for (channel, m), analysed, templates in zip(made, prepared.maps, templates_of(prepared.preparations), strict=True):
@@ -214,13 +218,24 @@ def inverse_covariance(
                 f"map {m.name} has no noise, so that nothing limits it; give channel {channel.name} noise "
                 "(noise.sigma0_uk or noise.depth_uk_arcmin above 0)."
             )
+        _refuse_lost_in_rounding(channel, m.name, m.noise_uk[m.moments.hits > 0], cl)
         seen = m.moments.hits > 0 if analysed.weight is None else (m.moments.hits > 0) & (analysed.weight > 0.0)
         response = convolve.Response(channel.response.factors[: settings.orders + 1])
         moments = m.moments if settings.orders else None
         maps.append(ObservedMap(response, divided(seen, m.noise_uk**2), moments, templates))
-    assert shared.cl is not None  # a model of the analysis has one
-    cl = unknown_dipole(shared.cl, settings.unknown_dipole_uk)
     return InverseCovariance(cl, maps, settings.tolerance, nthreads)
+
+
+def _refuse_lost_in_rounding(channel: Channel, name: str, noise_uk: Vector, cl: Cl) -> None:
+    """Raise InputError for a map whose sky is so far above its noise that sums of both have lost that."""
+    seen = np.abs(channel.response.factors[0]) ** 2 * cl
+    rms = float(np.sqrt((2 * np.arange(cl.size) + 1) @ seen / (4.0 * np.pi)))
+    if rms > MOST * (least := float(np.min(noise_uk[noise_uk > 0.0], initial=np.inf))):
+        raise InputError(
+            f"map {name} has noise of {least:.2g} uK in a pixel under a sky of {rms:.2g} uK, a ratio of "
+            f"{rms / least:.2g}, and beyond {MOST:g} rounding is more than the noise; give channel {channel.name} more "
+            "(noise.sigma0_uk or noise.depth_uk_arcmin)."
+        )
 
 
 def _with_declared(run: config.RunConfig, settings: LimitSettings) -> tuple[config.RunConfig, LimitSettings]:

@@ -465,6 +465,19 @@ def test_bad_input_is_refused() -> None:
             mcsim.LimitSettings(**{name: 0.05})
 
 
+@pytest.mark.parametrize("dense", [True, False])
+def test_noise_that_rounding_hides_is_refused(dense: bool) -> None:
+    """Of a sky 10^7 times the noise sigma of a noise level was a tenth of what it is; whole matrices were a traceback.
+
+    That of a map with noise alone in all but n modes of its N pixels is 1 / sqrt(2 (N - n)), whatever the noise is.
+    """
+    settings = mcsim.LimitSettings(only=("noise_level",), dense=dense, probes=32)
+    [found] = mcsim.limit(one_map(8, sigma0_uk=1e-4), settings=settings).effects
+    assert found.sigma == pytest.approx((2 * (768 - 45)) ** -0.5, rel=0.01 if dense else 0.1)
+    with refused("W1", 1e-5, "noise.sigma0_uk"):
+        mcsim.limit(one_map(8, sigma0_uk=1e-5), settings=settings)
+
+
 def test_an_effect_that_cannot_act_is_named_beside_one_that_can() -> None:
     """It was left out without a word."""
     still = model(sky={"spectrum": "wmap7", "lmax": LMAX})
