@@ -22,6 +22,7 @@ from mcsim.simulation.survey import Survey
 from mcsim.simulation.survey import survey as survey_
 from mcsim.support import folders
 from mcsim.support.npy import write_npy
+from mcsim.systematics import if_possible
 
 SEED = 0x6D63 * 1_000 + 3  #: seed of the controls; the simulations that a diagnosis learns with have two others
 
@@ -69,21 +70,18 @@ def fidelity(analysis: Analysis, nthreads: int = 1) -> Fidelity:
     run, by_sample = seeded(own.config, SEED), _sampled(own)
     reach = max(run.sky.lmax, power.reach(own, REST))
     for finer, lmax in _tried(run, reach, by_sample):
-        try:
+        with if_possible():  # a file may not fit
             return Fidelity(survey_(_refined(run, finer, lmax), nthreads, library=known), by_sample)
-        except InputError:  # a file that does not fit
-            continue
     return Fidelity(survey_(run, nthreads, library=known), by_sample)
 
 
 def _sampled(own: Survey) -> bool:
     """Return True if all channels can be simulated sample by sample."""
-    try:
+    with if_possible():
         for channel in own.making.channels:
             sampled.check(channel)
-    except InputError:
-        return False
-    return True
+        return True
+    return False
 
 
 def _tried(run: config.RunConfig, reach: int, by_sample: bool) -> Iterator[tuple[int, int]]:

@@ -80,7 +80,8 @@ class SplitCalibration(Effect):
 
     def steady_gain(self, site: Site) -> float:
         if self.split not in site.splits:
-            known = f"choose from {', '.join(site.splits)}" if site.splits else "name the splits in map.splits"
+            several = len(site.splits) > 1
+            known = f"choose from {', '.join(site.splits)}" if several else "name two or more splits in map.splits"
             raise InputError(f"effect {self.name}: split = {self.split!r} is no split of {site.channel}; {known}.")
         return _leaving_signal(self) if site.split == self.split else 0.0
 

@@ -139,6 +139,8 @@ def test_a_calibration_of_one_split_leaves_some_signal_and_names_a_split():
         prepared(OF_SPLIT | {"amplitude": -1.5}, splits=["a", "b"])
     with refused("split_calibration", "c", "a, b"):
         prepared(OF_SPLIT | {"split": "c"}, splits=["a", "b"])
+    with refused("split_calibration", "c", "map.splits"):
+        prepared(OF_SPLIT | {"split": "c"}, splits=["a"])
 
 
 def test_gains_of_one_split_and_of_the_year_add():
