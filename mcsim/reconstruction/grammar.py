@@ -293,14 +293,16 @@ def _modulations(scene: Scene) -> Iterator[Structure]:
 def _scaled(scene: Scene) -> Iterator[Structure]:
     """Yield what all channels have in proportion to a power of the frequency, but separated components.
 
-    Light is added, whatever a beam makes of it; gains and beams depart as GROWTH.
+    Light is added, whether it is fixed to the sky or follows beam, spacecraft, time or Sun; gains and beams depart as
+    GROWTH.
     """
     if not scene.shared:
         return
-    light = [*_added(scene), *_turned(scene, scene.views[scene.shared[0]])]
     for k, index in enumerate(scene.scalings):
         for split, views, weights in _in_proportion(scene, index):
-            yield from (_shared(scene, split, index, views, weights, form) for form in light)
+            for form in _forms(scene, split, list(views)):
+                if form[:2] == ("added", ""):
+                    yield _shared(scene, split, index, views, weights, form)
         keys: list[Key] = [("summed", k, b) for b in range(len(scene.fine) - 1)]
         yield replace(_plain(scene, "added", "sky", "power", None, keys), index=index)
     for split, views, weights in _in_proportion(scene, GROWTH):

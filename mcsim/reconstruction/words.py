@@ -32,7 +32,8 @@ _LIKE: tuple[tuple[str, str, str, str], ...] = (
 
 def cause(structure: Structure, library: Library) -> str:
     """Return a known cause of such structures with its reference, or nothing."""
-    name = "foreground_residual" if structure.index is not None and structure.stage == "added" else ""
+    light = structure.index is not None and (structure.stage, structure.frame) == ("added", "sky")
+    name = "foreground_residual" if light else ""
     if (structure.stage, structure.kind) == ("gain", "constant") and structure.split not in (ALIKE, OPPOSITE):
         name = "split_calibration"
     for stage, frame, kind, effect in _LIKE if not name else ():

@@ -51,6 +51,8 @@ def test_what_frequencies_share_is_in_all_maps_but_those_of_a_component_separati
         ("added", "sky", "degrees 0-2", "half2", -3.0),
         ("added", "sky", "degrees 0-2", "opposite", -3.0),
         ("added", "sky", "orientation 2 degree 2", "half2", -3.0),
+        ("added", "time", "spin 1", ALIKE, -3.0),
+        ("added", "Sun", "dipole", "opposite", -2.0),
         ("gain", "", "constant", ALIKE, GROWTH),
         ("gain", "sky", "degrees 0-1", ALIKE, GROWTH),
         ("gain", "time", "year 1", "half2", GROWTH),
