@@ -29,7 +29,7 @@ from mcsim.sphere import rng
 from mcsim.support.arrays import Vector
 from mcsim.support.folders import appearing, user_path, writable
 from mcsim.support.progress import reporting
-from mcsim.systematics import HookError
+from mcsim.systematics import if_possible
 
 SMALLER = 0.7  #: factor between one trial of an amplitude and the next
 
@@ -139,13 +139,10 @@ def _measured(model: LearnedModel, member: Member, seed: int) -> Member:
     for attempt in range(ATTEMPTS):
         parameters = {**member.parameters, "amplitude": SMALLER**attempt * member.parameters["amplitude"]}
         effect = candidate.effect(**parameters)
-        try:
+        strength = None
+        with if_possible():
             strength = model.expected_snr(candidate.table(effect))
-        except HookError:
-            raise
-        except InputError:
-            continue
-        if strength > STRONGER * member.strength and attempt + 1 < ATTEMPTS:
+        if strength is None or (strength > STRONGER * member.strength and attempt + 1 < ATTEMPTS):
             continue
         coordinates = tuple(float(value) for value in candidate.parametrization.coordinates(effect))
         if not candidate.parametrization.stochastic:
