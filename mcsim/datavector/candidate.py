@@ -46,6 +46,8 @@ class Candidate:
     # Deviations of its response from the mean one if it is stochastic, shape (p, draws), as
     # SimulatedGaussian.with_extra_covariance takes them; None if they are not known.
     scatter: Matrix | None = field(default=None, compare=False)
+    # Deviations of what its draws do together with other candidates, by their place, and neither does alone; likewise.
+    crossed: Mapping[int, Matrix] = field(default_factory=dict, compare=False)
     # Otherwise by how much its effect scatters the data; None if it is not known.
     acting: Acting | None = field(default=None, compare=False)
     # It is a nuisance as well, within its prior: its templates are those of the scatter that this makes.
@@ -243,8 +245,16 @@ def lost(candidates: Sequence[Candidate], members: Sequence[int], found: Fit, n:
 
 
 def scatters_of(candidates: Sequence[Candidate], members: Sequence[int]) -> list[Matrix]:
-    """Return the scatter of the responses of members where it is known."""
-    return [one for one in (candidates[member].scatter for member in members) if one is not None]
+    """Return the scatter of the responses of members where it is known, and behind it what they scatter together."""
+    own = [one for one in (candidates[member].scatter for member in members) if one is not None]
+    pairs = ((candidates[member], other) for member in members for other in members)
+    return own + [one.crossed[other] for one, other in pairs if other in one.crossed]
+
+
+def scattering(candidates: Sequence[Candidate]) -> list[int]:
+    """Return the candidates whose scatter is known, by themselves or beside one that draws its pattern."""
+    beside = {other for one in candidates for other in one.crossed}
+    return [place for place, one in enumerate(candidates) if one.scatter is not None or place in beside]
 
 
 def coordinates_of(candidates: Sequence[Candidate], members: Sequence[int], effects: Sequence[Effect]) -> Vector:

@@ -108,30 +108,30 @@ class Action:
 
     ``response`` is that at the fitted amplitude, shape (p + E,), and ``error`` the relative error of the amplitude;
     ``directions``, shape (p + E, K - 1), are the responses to changes of its parameters that leave the amplitude.
-    ``scatter``, shape (p + E, draws), has the deviations of the draws of a stochastic effect; ``growth`` is the factor
-    of the variance of noise, and so of the standard deviation of its power, and ``wider`` that of the errors of
-    amplitudes with the effect in the data. ``pair`` are data of the same skies without the effect and with it, (skies,
-    p + E) each.
+    ``scatters``, shape (p + E, draws), have the deviations of the draws of a stochastic effect, and of what it does
+    together with others; ``growth`` is the factor of the variance of noise, and so of the standard deviation of its
+    power, and ``wider`` that of the errors of amplitudes with the effect in the data. ``pair`` are data of the same
+    skies without the effect and with it, (skies, p + E) each.
     """
 
     response: Vector
     directions: Matrix
     error: float
-    scatter: Matrix | None = None
+    scatters: tuple[Matrix, ...] = ()
     growth: float = 1.0
     wider: float = 1.0
     pair: tuple[Matrix, Matrix] | None = None
 
     @classmethod
     def of(
-        cls, response: Vector, t: Matrix, theta: Vector, covariance: Matrix, scatter: Matrix | None = None
+        cls, response: Vector, t: Matrix, theta: Vector, covariance: Matrix, scatters: Sequence[Matrix] = ()
     ) -> "Action":
         """Make it from the response and templates, shape (p + E, K), fitted with these amplitudes."""
         weight = np.linalg.pinv(covariance) @ theta
         snr = float(weight @ theta)
         # Independent of the amplitude in the metric of the fit.
         rest = np.linalg.svd(weight[None])[2][1:].T
-        return cls(response, t @ rest, 1.0 / np.sqrt(max(snr, 1.0)), scatter)
+        return cls(response, t @ rest, 1.0 / np.sqrt(max(snr, 1.0)), tuple(scatters))
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class Slices:
         of their white norm. Odds without the best part are those of amplitude 0 against 1 in all others. The scatter of
         stochastic effects is a part of the covariance.
         """
-        scatters = tuple(action.scatter for action in actions if action.scatter is not None)
+        scatters = tuple(scatter for action in actions for scatter in action.scatters)
         if scatters and not self.scatters:
             return replace(self, scatters=scatters, nulls={}).findings(candidates, actions)
         # More noise, or a pattern that is drawn, is more of chi^2: what is left in the maps then says nothing of it.

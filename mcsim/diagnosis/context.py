@@ -183,6 +183,10 @@ class DataSet(ABC, Generic[Data]):
         before, after = self.pair_extended(found, skies)
         return after - before
 
+    def typical(self, found: Sequence[config.Effect], skies: int) -> Matrix:
+        """Return the changes of :meth:`respond_extended` in skies that nothing constrains, the same for all effects."""
+        return self.respond_extended(found, skies)
+
     def responses(self, candidates: Sequence[Candidate], skies: int) -> Iterator[tuple[Candidate, Matrix]]:
         """Yield those that can be simulated with their responses to small effects over coordinates, (p + E, K)."""
         return over_steps(candidates, lambda table: self.respond_extended([table], skies))

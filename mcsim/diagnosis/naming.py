@@ -5,13 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from mcsim import config
 from mcsim.datavector.candidate import Candidate, parts_of
 from mcsim.diagnosis.consistency import Action, Slices, contradiction
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
+from mcsim.diagnosis.crossed import together
 from mcsim.diagnosis.drawn import is_drawn
 from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.stats.scattered import GROWS
+from mcsim.support.arrays import Matrix
 from mcsim.systematics import if_possible
 
 
@@ -127,7 +130,7 @@ def _actions(data: DataSet, refined: Refined, one: Explanation) -> Iterator[Acti
         draws = tried.scatter is not None or candidate.parametrization.nonlinear
         added = 0.0 if draws or tried.acting is None else max(tried.acting.own, 0.0)
         few = settings.strong_skies if added > GROWS else settings.constrained_skies
-        t, growth, scatter = whole[:, list(candidate.columns)], 1.0, None
+        t, growth, scatters = whole[:, list(candidate.columns)], 1.0, list[Matrix]()
         response, pair = t @ theta, None
         with if_possible():
             effect = candidate.detected(theta, covariance)
@@ -137,7 +140,18 @@ def _actions(data: DataSet, refined: Refined, one: Explanation) -> Iterator[Acti
             if not known:
                 own = (i for i, name in enumerate(model.channels) if candidate.channel in (None, name))
                 growth = max([1.0, *(model.noise_change([effect], i) for i in own)])
-            response, scatter = (after - before).mean(axis=0), data.scatter(after - before) if draws else None
+            response, scatters = (after - before).mean(axis=0), [data.scatter(after - before)] if draws else []
+            scatters += _beside(data, refined, one, member, table)
             pair = None if draws or known else (before, after)
-        action = Action.of(response, t, theta, (1.0 + added) * covariance, scatter)
+        action = Action.of(response, t, theta, (1.0 + added) * covariance, scatters)
         yield replace(action, growth=growth, wider=max(growth, float(np.sqrt(1.0 + added))), pair=pair)
+
+
+def _beside(data: DataSet, refined: Refined, one: Explanation, member: int, table: config.Effect) -> Iterator[Matrix]:
+    """Yield what a member that draws its pattern does together with others of a set, at their amplitudes."""
+    candidates = refined.candidates
+    for other, *at in parts_of(candidates, one.members, one.fit):
+        if other in candidates[member].crossed:
+            beside = candidates[other].table(candidates[other].detected(*at))
+            if (scatter := together(data, table, beside)) is not None:
+                yield scatter

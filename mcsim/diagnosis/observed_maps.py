@@ -72,6 +72,11 @@ class ObservedMaps(DataSet[Sequence[Map]]):
             return self.of_reference(found)
         return self.same_skies.pair(found, skies, kind == "constrained")
 
+    def typical(self, found: Sequence[config.Effect], skies: int) -> Matrix:
+        """Return the changes by effects in skies that nothing constrains, shape (skies, p + E)."""
+        before, after = self.same_skies.pair(found, skies, constrained=False)
+        return after - before
+
     def of_reference(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix]:
         """Return data of the skies of reference without effects and with them, shape (skies, p + E) each.
 

@@ -1,7 +1,8 @@
 """Simulate responses at the fitted amplitudes, where effects are too strong for a linear response."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from scipy import special
@@ -9,7 +10,9 @@ from scipy import special
 from mcsim.datavector.bent import beyond
 from mcsim.datavector.candidate import Candidate, Part, columns_of, parts_of, scatters_of
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
+from mcsim.diagnosis.crossed import MOVED, cross
 from mcsim.diagnosis.partial import PartialExplanation, PartialSearch, has_settled
+from mcsim.diagnosis.responses import Responses, steepness
 from mcsim.diagnosis.selection import Attribution, Explanation, Selection, attribute
 from mcsim.stats.detection import cosines
 from mcsim.stats.gaussian import Fit
@@ -18,13 +21,11 @@ from mcsim.support.arrays import Matrix, Vector
 from mcsim.systematics import if_possible
 
 ALIKE = 0.7  #: cosine of linear responses from which on one candidate can pass for another
-STEEPEST = 9.0  #: a response is never taken to grow with more than the tenth power of its amplitude
 WIDE = 8.0
 """Variance that an effect adds along its own response, over that without it, from which on its scatter is drawn: what
 it makes of noise and of the part of the sky that is not known, and what is like it makes otherwise, is no small part of
 the difference of the two then."""
 
-MOVED = 0.1  #: share of coordinates by which they move from which on what they scatter is drawn anew
 BENT = 1.5  #: by which a bend may be larger than it is told, of other skies and at an amplitude that it makes too small
 TOGETHER = 3  #: members of the largest sets that are simulated where nothing else explains the data
 NEARLY = 0.8  #: share of what the best single candidate explains, from which on others are tried that explain less
@@ -47,27 +48,6 @@ class Refined:
 
 
 @dataclass(frozen=True)
-class _Responses:
-    """Hold linear templates, those at the amplitudes that were simulated, candidates, and these amplitudes.
-
-    They are the nearest possible ones to those ``asked`` for. ``last`` has where a candidate was simulated before, and
-    the amplitudes that the data had by the templates of there.
-    """
-
-    linear: Matrix
-    t: Matrix
-    candidates: list[Candidate]
-    done: dict[int, Vector | None] = field(default_factory=dict)
-    asked: dict[int, Vector] = field(default_factory=dict)
-    last: dict[int, tuple[Vector, Vector]] = field(default_factory=dict)
-
-    def copy(self) -> "_Responses":
-        """Return another one to which nothing of what is simulated from now on is added."""
-        done, asked, last = self.done.copy(), self.asked.copy(), self.last.copy()
-        return _Responses(self.linear, self.t.copy(), self.candidates.copy(), done, asked, last)
-
-
-@dataclass(frozen=True)
 class Refiner:
     """Attribute, simulate what was named at its amplitude, and attribute again until nothing changes."""
 
@@ -81,7 +61,7 @@ class Refiner:
     def unrefined(self) -> Refined:
         """Return the attribution by the templates of the model, without any simulation."""
         t, candidates = self.context.templates, self.context.candidates
-        return Refined(self._attribute(_Responses(t, t, [*candidates])), t, candidates, t)
+        return Refined(self._attribute(Responses(t, t, [*candidates])), t, candidates, t)
 
     def run(
         self,
@@ -107,7 +87,7 @@ class Refiner:
         fits worse. A faint gap has the odds of the first templates at most.
         """
         start = t if start is None else start
-        now = _Responses(t, start.copy(), list(candidates))
+        now = Responses(t, start.copy(), list(candidates))
         first = found = self._attribute(now)
         for _ in range(self.context.settings.refine_rounds):
             fitted = (part for members in sets for part in self._fitted(now, members)[1])
@@ -118,7 +98,7 @@ class Refiner:
             found = self._attribute(now)
         now, found = self._with_smaller(now, self._completed(now, found))
         if found.verdict == "unknown" and not (found.faint or sets):
-            now, found = self._with_sets(now, found, _Responses(t, t.copy(), list(candidates)))
+            now, found = self._with_sets(now, found, Responses(t, t.copy(), list(candidates)))
         for index in self._displaced(now, first, found):
             alone = self._alone(now, start, index)
             own = self._completed(alone, self._attribute(alone))
@@ -134,7 +114,7 @@ class Refiner:
         detected = PartialSearch(self.data).run(now.t, now.candidates) if found.verdict == "unknown" else None
         if detected is not None and len(detected.members) <= self.context.settings.max_effects:
             done = {member: now.done.get(member) for member in detected.members}
-            beside = _Responses(now.linear, detected.templates.copy(), [*now.candidates], done)
+            beside = Responses(now.linear, detected.templates.copy(), [*now.candidates], done)
             together = self._completed(beside, self._attribute(beside))
             if together.explanations:
                 now, found, detected = beside, together, None
@@ -143,34 +123,43 @@ class Refiner:
             found = replace(found, probability=min(found.probability, first.probability))
         return Refined(found, now.t, tuple(now.candidates), t, detected)
 
-    def _fitted(self, now: _Responses, members: Sequence[int]) -> tuple[Fit, list[Part]]:
-        """Return the fit of a set, and its members with their coordinates."""
-        fit = self.context.null.fit(self.data.x, now.t[:, columns_of(now.candidates, members)])
+    def _fitted(self, now: Responses, members: Sequence[int]) -> tuple[Fit, list[Part]]:
+        """Return the fit of a set, whose members may scatter the data, and its members with their coordinates."""
+        null = self.context.null.with_extra_covariance(*scatters_of(now.candidates, members))
+        fit = null.fit(self.data.x, now.t[:, columns_of(now.candidates, members)])
         return fit, list(parts_of(now.candidates, members, fit))
 
-    def _completed(self, now: _Responses, found: Attribution) -> Attribution:
+    def _cross(self, now: Responses, members: Sequence[int]) -> bool:
+        """Draw what members of a set scatter together at their amplitudes there; return True if anything changed."""
+        return cross(self.data, now.candidates, now.crossed, self._fitted(now, members)[1])
+
+    def _completed(self, now: Responses, found: Attribution) -> Attribution:
         """Return the attribution once each member of its best sets has been simulated, at the fitted amplitude."""
-        while best := found.explanations[:2]:
+        for _ in range(self.context.settings.refine_rounds):
+            best = found.explanations[:2]
             parts = [part for one in best for part in parts_of(now.candidates, one.members, one.fit)]
             untried = {part[0]: part for part in parts if part[0] not in now.done}
             changed = [self._simulate(now, *part) for part in untried.values()]
             changed += [self._simulate_in_place(now, *place) for one in best for place in self._alike(now, one)]
+            changed += [self._cross(now, one.members) for one in best]
             if not any(changed):
                 break
             found = self._attribute(now)
         return found
 
-    def _with_smaller(self, now: _Responses, found: Attribution) -> tuple[_Responses, Attribution]:
+    def _with_smaller(self, now: Responses, found: Attribution) -> tuple[Responses, Attribution]:
         """Return responses and attribution with a smaller set, if one suffices once it is simulated at its amplitudes.
 
         Single candidates are simulated at theirs beforehand. What a bent response leaves of the data seems to be more
         effects until it is simulated beside the others that act.
         """
         size = _size(found)
-        smaller = (one for one in self._in_place(now, size) if 0 < _size(one[1]) < size)
+        best = found.explanations[:2] if size > 2 else ()
+        parts = [part for one in best for part in combinations(one.members, size - 1)]
+        smaller = (one for one in self._in_place(now, size, parts) if 0 < _size(one[1]) < size)
         return next(smaller, (now, found))
 
-    def _with_sets(self, now: _Responses, found: Attribution, first: _Responses) -> tuple[_Responses, Attribution]:
+    def _with_sets(self, now: Responses, found: Attribution, first: Responses) -> tuple[Responses, Attribution]:
         """Return responses and attribution with a set that suffices once it is simulated from the ``first`` responses.
 
         Two effects that bend may each explain less alone than others, which are simulated in their place.
@@ -178,22 +167,30 @@ class Refiner:
         sufficient = (one for one in self._in_place(first, TOGETHER + 1) if one[1].explanations)
         return next(sufficient, (now, found))
 
-    def _in_place(self, now: _Responses, size: int) -> Iterator[tuple[_Responses, Attribution]]:
+    def _in_place(
+        self, now: Responses, size: int, sets: Sequence[tuple[int, ...]] = ()
+    ) -> Iterator[tuple[Responses, Attribution]]:
         """Yield responses with the members of a set simulated at their amplitudes, and the attribution by them.
 
-        The sets have several members, fewer than a size, and explain nearly as much as the best of as many.
+        First of ``sets``; then of those that have several members, fewer than a size, and explain nearly as much as the
+        best of as many: among these none is of effects whose scatter is drawn.
         """
         chosen = self._selection(now)
+        tried = list(sets)
         for fewer in range(2, size):
             ranked = chosen.most_probable(fewer, 2 * self.context.settings.tried)
             most = max((fit.delta_chi2 for _, fit in ranked), default=0.0)
-            for members in [members for members, fit in ranked if fit.delta_chi2 >= NEARLY * most]:
-                beside = now.copy()
+            tried += [members for members, fit in ranked if fit.delta_chi2 >= NEARLY * most]
+        for members in dict.fromkeys(tried):
+            beside = now.copy()
+            for _ in range(self.context.settings.refine_rounds):
                 for index in members:
                     self._simulate_in_place(beside, tuple(one for one in members if one != index), index)
-                yield beside, self._completed(beside, self._attribute(beside))
+                if not self._cross(beside, members):
+                    break
+            yield beside, self._completed(beside, self._attribute(beside))
 
-    def _alike(self, now: _Responses, one: Explanation) -> list[tuple[tuple[int, ...], int]]:
+    def _alike(self, now: Responses, one: Explanation) -> list[tuple[tuple[int, ...], int]]:
         """Return candidates that were not simulated and are like a member of a set, behind the other members.
 
         All of them if the residual does not pass without an error of the templates: far from linear responses what is
@@ -217,7 +214,7 @@ class Refiner:
                     found.setdefault(index, others)
         return [(others, index) for index, others in found.items()]
 
-    def _may_replace(self, now: _Responses, one: Explanation, others: tuple[int, ...], index: int) -> bool:
+    def _may_replace(self, now: Responses, one: Explanation, others: tuple[int, ...], index: int) -> bool:
         """Return True if an effect fits worse than a set beside others by no more than its bent response may cost it.
 
         A template that is wrong by b standard deviations raises chi^2 of the true effect by b^2 on average, with a
@@ -233,7 +230,7 @@ class Refiner:
         allowed = (BENT * bend + 2.0) ** 2 + 2.0 * np.log(settings.odds_cut)
         return bend > settings.nonlinear_sigma and fit.chi2 - one.fit.chi2 <= allowed
 
-    def _simulate_in_place(self, now: _Responses, others: tuple[int, ...], index: int) -> bool:
+    def _simulate_in_place(self, now: Responses, others: tuple[int, ...], index: int) -> bool:
         """Simulate a candidate beside others at its amplitude until that settles; return True if anything changed."""
         changed = False
         for _ in range(self.context.settings.refine_rounds):
@@ -244,7 +241,7 @@ class Refiner:
         return changed
 
     def _simulate(
-        self, now: _Responses, index: int, coordinates: Vector, covariance: Matrix, curved: bool = False
+        self, now: Responses, index: int, coordinates: Vector, covariance: Matrix, curved: bool = False
     ) -> bool:
         """Simulate a candidate at fitted coordinates, and return True, unless it has been there.
 
@@ -263,7 +260,7 @@ class Refiner:
         if (stochastic or nonlinear) and done is not None:
             share = self._squared(now.linear[:, columns], now.t[:, columns], done)
             if index in now.last:
-                share = max(share, _steepness(now.last[index], (done, coordinates), covariance))
+                share = max(share, steepness(now.last[index], (done, coordinates), covariance))
             now.last[index] = done, coordinates
             coordinates = done + (coordinates - done) / (1.0 + share)
         now.done[index] = now.asked[index] = coordinates
@@ -292,7 +289,7 @@ class Refiner:
                 now.candidates[index] = replace(candidate, acting=None, scatter=self.data.scatter(drawn))
         return True
 
-    def _has_been(self, now: _Responses, index: int, coordinates: Vector, covariance: Matrix) -> bool:
+    def _has_been(self, now: Responses, index: int, coordinates: Vector, covariance: Matrix) -> bool:
         """Return True if a candidate was simulated about at these coordinates, or at the possible ones next to them."""
         candidate, settings = now.candidates[index], self.context.settings
         if has_settled(settings, now.asked.get(index), coordinates, covariance):
@@ -302,7 +299,7 @@ class Refiner:
             return has_settled(settings, now.done.get(index), at, covariance)
         return False
 
-    def _displaced(self, now: _Responses, first: Attribution, found: Attribution) -> list[int]:
+    def _displaced(self, now: Responses, first: Attribution, found: Attribution) -> list[int]:
         """Return candidates that explain less alone than by their first templates, and were simulated elsewhere.
 
         In a set the amplitudes of effects that are alike can be large and of opposite signs. A response that was
@@ -316,14 +313,16 @@ class Refiner:
             and not has_settled(self.context.settings, done, alone.amplitudes, alone.covariance)
         ]
 
-    def _alone(self, now: _Responses, start: Matrix, index: int) -> _Responses:
+    def _alone(self, now: Responses, start: Matrix, index: int) -> Responses:
         """Return the responses with a candidate at the amplitude that it has alone, by its first templates at first."""
         null, columns = self.context.null, list(now.candidates[index].columns)
         now = now.copy()
         for known in (now.done, now.asked, now.last):
             known.pop(index, None)
         now.t[:, columns] = start[:, columns]
-        now.candidates[index] = replace(now.candidates[index], scatter=None)
+        for pair in [pair for pair in now.crossed if pair[0] == index]:
+            del now.crossed[pair]
+        now.candidates[index] = replace(now.candidates[index], scatter=None, crossed={})
         for _ in range(self.context.settings.refine_rounds):
             wide = null.with_extra_covariance(*scatters_of(now.candidates, [index]))
             fit = wide.fit(self.data.x, now.t[:, columns])
@@ -331,10 +330,10 @@ class Refiner:
                 break
         return now
 
-    def _attribute(self, now: _Responses) -> Attribution:
+    def _attribute(self, now: Responses) -> Attribution:
         return attribute(self._selection(now), self.data.gap)
 
-    def _selection(self, now: _Responses) -> Selection:
+    def _selection(self, now: Responses) -> Selection:
         known = self.context
         return Selection(known.null, self.data.x, now.t, now.candidates, known.calibration, known.settings)
 
@@ -413,17 +412,6 @@ class Refiner:
         shift = self.context.bank.curvature[:, columns] @ coordinates**2
         crossed = float(np.sum(np.abs(coordinates)) ** 2) / max(float(coordinates @ coordinates), 1e-300)
         return crossed * float(np.linalg.norm(self.context.null.whiten_templates(shift[:, None])))
-
-
-def _steepness(before: tuple[Vector, Vector], now: tuple[Vector, Vector], covariance: Matrix) -> float:
-    """Return by how much fitted coordinates fall as those rise that templates are simulated at, 0 to STEEPEST.
-
-    Both are given of two simulations. It is n - 1 of a response that grows with the n-th power of its amplitude.
-    """
-    precision = np.linalg.pinv(covariance)
-    moved, fitted = now[0] - before[0], now[1] - before[1]
-    size = float(moved @ precision @ moved)
-    return float(np.clip(-(moved @ precision @ fitted) / size, 0.0, STEEPEST)) if size > 0.0 else 0.0
 
 
 def _nearly_best(explained: Vector, ranked: Sequence[int], least: int) -> Sequence[int]:

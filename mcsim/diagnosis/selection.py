@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from scipy import special
 
-from mcsim.datavector.candidate import Candidate, beyond, columns_of
+from mcsim.datavector.candidate import Candidate, beyond, columns_of, scattering, scatters_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.consistency import Findings
 from mcsim.diagnosis.subsets import EXHAUSTIVE, Subsets, chunks
@@ -275,21 +275,22 @@ class Selection:
 
         Combinations of candidates that exclude each other are left out.
         """
-        scatters = [index for index, candidate in enumerate(self.candidates) if candidate.scatter is not None]
         most = min(SCATTERED, self.settings.max_effects)
-        sets = [members for size in range(most + 1) for members in combinations(scatters, size)]
+        sets = [members for size in range(most + 1) for members in combinations(scattering(self.candidates), size)]
         return [self.search(own) for own in sets if len({self.candidates[k].identity for k in own}) == len(own)]
 
     def search(self, members: Sequence[int]) -> Subsets:
         """Return the search of sets with all of the members whose scatter is known."""
-        scatters = {member: one for member in members if (one := self.candidates[member].scatter) is not None}
-        columns, known = [candidate.columns for candidate in self.candidates], list(scatters.values())
+        every = set(scattering(self.candidates))
+        own = tuple(member for member in members if member in every)
+        columns, known = [candidate.columns for candidate in self.candidates], scatters_of(self.candidates, own)
+        drawn = [member for member in own if self.candidates[member].scatter is not None]
         wide = self.null.with_extra_covariance(*known)
-        beside = variance_beside(self.null, self.t, columns, list(scatters), known)
+        beside = variance_beside(self.null, self.t, columns, drawn, known)
         groups, y = wide.whiten_groups(self.t, columns), wide.whiten(self.x)
         # What others add to the scatter is less over the scatter of these.
-        each = self.candidates if not scatters else list(self._acting_beside(wide, columns))
-        return Subsets(wide, y, groups, each, self.calibration, self.settings, tuple(scatters), beside)
+        each = self.candidates if not known else list(self._acting_beside(wide, columns))
+        return Subsets(wide, y, groups, each, self.calibration, self.settings, own, beside)
 
     def _acting_beside(self, wide: SimulatedGaussian, columns: Groups) -> Iterator[Candidate]:
         """Yield the candidates with what they add to the scatter of data of another distribution."""

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 from scipy import special
 
-from mcsim.datavector.candidate import Candidate
+from mcsim.datavector.candidate import Candidate, scattering
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.stats.detection import log_evidence
 from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, Tolerated, WhitenedTemplates
@@ -96,7 +96,7 @@ class Subsets:
     @cached_property
     def _free(self) -> Rows:
         """Return the candidates whose scatter is not known."""
-        return np.flatnonzero([candidate.scatter is None for candidate in self.candidates])
+        return np.setdiff1d(np.arange(len(self.candidates)), scattering(self.candidates))
 
     def rows(self, size: int) -> Iterator[Rows]:
         """Yield all subsets without exclusive members, shape (M, size), all of the same ranks."""

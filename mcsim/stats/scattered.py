@@ -207,7 +207,7 @@ def with_drawn_scatter(
 
     ``null`` is the distribution without them; ``scatters``, with which it was widened for the fit, are deviations as of
     :meth:`SimulatedGaussian.with_extra_covariance`. ``alone`` are those of the data vectors of the same skies without
-    them, where these are correlated with what is drawn.
+    the first ones, where these are correlated with what is drawn.
 
     Notes
     -----
@@ -226,7 +226,7 @@ def with_drawn_scatter(
     own = weights(scatters) @ white * np.sqrt(1.0 + 1.0 / null.n_sims)
     covariance, crossed = scale * own @ own.T, np.zeros(found.covariance.shape)
     for place, draws in enumerate(scatters):
-        data = alone[place] if alone else None
+        data = alone[place] if place < len(alone) else None
         for k in range(draws.shape[1]):
             others = [*scatters[:place], without(draws, k), *scatters[place + 1 :]]
             each = weights(others)

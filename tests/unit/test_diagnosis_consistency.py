@@ -104,11 +104,11 @@ class Bench:
         self.t = np.concatenate([shape, -shape, 2.0 * shape, -2.0 * shape])
         self.signs = np.repeat([1.0, -1.0, 1.0, -1.0], 4)
 
-    def findings(self, signal, theta, seed=None, candidate=GAIN, scatter=None, wider=1.0, pair=None):
+    def findings(self, signal, theta, seed=None, candidate=GAIN, scatters=(), wider=1.0, pair=None):
         z = signal + (0.0 if seed is None else np.random.default_rng([4, seed]).normal(size=16))
         tested = Slices(self.ensemble, z, 8, ("half1", "half2"), 24, DiagnosisSettings())
         covariance = wider**2 * np.linalg.inv(self.t.T @ self.t)
-        action = replace(Action.of(self.t @ theta, self.t, theta, covariance, scatter), wider=wider, pair=pair)
+        action = replace(Action.of(self.t @ theta, self.t, theta, covariance, scatters), wider=wider, pair=pair)
         return tested.findings([candidate], [action])
 
 
@@ -192,7 +192,7 @@ def test_the_scatter_of_draws_is_no_contradiction(bench, known):
         draws = 3.0 * draw.normal(size=(16, 24))
         scatter = (draws - draws.mean(axis=1, keepdims=True)) * np.sqrt((1.0 + 1.0 / 24.0) / 23.0)
         signal = 3.0 * (bench.t @ THETA + draw.normal(size=16))
-        found = bench.findings(signal, 3.0 * THETA, seed, scatter=scatter if known else None)
+        found = bench.findings(signal, 3.0 * THETA, seed, scatters=[scatter] if known else ())
         refused += found.contradict(DiagnosisSettings())
     # 1 % of 100, and more than 5 once in a thousand runs.
     assert refused <= 5 if known else refused >= 30

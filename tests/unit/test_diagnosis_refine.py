@@ -10,6 +10,7 @@ from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.partial import PartialSearch, has_settled
 from mcsim.diagnosis.refine import Refiner, _nearly_best
+from mcsim.diagnosis.responses import Responses
 from mcsim.diagnosis.selection import Selection, attribute
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import SimulatedGaussian
@@ -88,6 +89,7 @@ class Instrument:
         known = {"null": self.null, "templates": self.t, "calibration": self.calibration, "settings": self.settings}
         context = SimpleNamespace(bank=bank, knows=lambda table: False, **known)
         own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter, "changes_sky": lambda tables: False}
+        own["typical"] = lambda tables, skies: sum(self.respond([table], skies) for table in tables)
         own["dipole_snr"] = lambda tables: float(tables[0].channel in self.crossed)
         groups = self.null.whiten_groups(self.t, [one.columns for one in self.candidates])
         gap = global_test(self.null, x, groups, self.calibration)
@@ -441,6 +443,29 @@ def test_what_was_simulated_far_away_in_a_set_is_tried_at_the_amplitude_that_it_
     (own,) = [one for one in found.explanations if one.members == (0,)]
     assert own.fit.amplitudes == pytest.approx([15.0], abs=0.3)
     assert {one.members for one in found.explanations} == {(0,), (2,)}
+
+
+def test_a_set_is_fitted_where_a_member_does_not_scatter_the_data() -> None:
+    """Half of a direction that B scatters is along A, which would be 45 there."""
+    instrument = Instrument(bend=0.0, cross=0.0)
+    along = instrument.t[:, 0] + instrument.sideways[0]
+    draws = np.random.default_rng(23).normal(size=12)
+    scatter = 1000.0 * np.outer(along, draws - draws.mean()) / np.sqrt(11.0)
+    candidates = [instrument.candidates[0], replace(instrument.candidates[1], scatter=scatter)]
+    data = SimpleNamespace(context=instrument, x=5.0 * instrument.t[:, 0] + 40.0 * along)
+    fit, parts = Refiner(data)._fitted(Responses(instrument.t, instrument.t, candidates), (0, 1))
+    assert fit.amplitudes == pytest.approx([5.0, 0.0], abs=0.5)
+    assert [part[0] for part in parts] == [0, 1]
+
+
+def test_the_parts_of_a_set_are_tried_in_its_place(monkeypatch) -> None:
+    tried: list[tuple[int, ...]] = []
+    monkeypatch.setattr(Refiner, "_in_place", lambda self, now, size, sets: iter(tried.extend(sets) or ()))
+    found = SimpleNamespace(explanations=[SimpleNamespace(members=(0, 1, 2)), SimpleNamespace(members=(3, 4, 5, 6))])
+    now = SimpleNamespace()
+    assert Refiner(SimpleNamespace())._with_smaller(now, found) == (now, found)
+    assert tried[:3] == [(0, 1), (0, 2), (1, 2)]
+    assert {len(one) for one in tried} == {2}
 
 
 def test_those_that_explain_nearly_as_much_as_the_best_are_tried_up_to_twice_as_many() -> None:
