@@ -3,8 +3,8 @@
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import chdir
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import chdir, contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -100,11 +100,8 @@ def source_of(run: config.RunConfig, given: Any) -> Source:
         return _code(parts, os.path.basename(text), made, None)
     label = getattr(given, "__name__", type(_whole(given)).__name__)
     if isinstance(given, type):
-        return _code(parts, label, cloudpickle.dumps(partial(_instance, given, config.to_json(run))), given)
-    try:
-        made = cloudpickle.dumps(partial(_same, given))
-    except Exception as error:  # of any type, from what the object holds
-        raise InputError(f"the simulator {given!r} cannot be sent to workers ({error}); hold no open files.") from error
+        return _code(parts, label, _pickled(partial(_of_class, given, config.to_json(run)), given), given)
+    made = _pickled(partial(_same, given), given)
     if len(made) > LARGEST:
         kept = arrays.kept(lambda folder: (folder / "simulator").write_bytes(made), "simulator") / "simulator"
         made = cloudpickle.dumps(partial(_read, str(kept)))
@@ -121,6 +118,14 @@ def seed_of(seed: int, realization: int) -> int:
         raise InputError(f"realization {realization} has no seed; there are {SEEDS} of a stream.")
     start = int(np.random.SeedSequence(seed).generate_state(1)[0])
     return (start + realization * _GOLDEN) % (1 << 32)
+
+
+def _pickled(made: Callable[[], Any], given: Any) -> bytes:
+    """Return the pickle of a function that returns a simulator; InputError for one that holds what has none."""
+    try:
+        return cloudpickle.dumps(made)
+    except Exception as error:  # of any type, from what the object holds
+        raise InputError(f"the simulator {given!r} cannot be sent to workers ({error}); hold no open files.") from error
 
 
 def _code(parts: tuple[Part, ...], label: str, made: bytes, given: Any) -> Code:
@@ -225,18 +230,29 @@ def _definition(simulator: Any) -> Any:
 def _resolved(text: str, run: str, written: str) -> Any:
     """Import a simulator; a class is made, with the description if it takes an argument."""
     module, _, name = text.rpartition(":")
-    try:
+    with _refusing(f"simulator = {text!r} cannot be loaded", "mend or install it"):
         found: Any = _of_path(module, written) if module.endswith(".py") else import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
         return _instance(found, run)
+
+
+def _of_class(kind: type, run: str) -> Any:
+    """Make a class that is given itself."""
+    with _refusing(f"simulator {kind.__name__} cannot be made", "mend it"):
+        return _instance(kind, run)
+
+
+@contextmanager
+def _refusing(what: str, remedy: str) -> Iterator[None]:
+    """Turn whatever a foreign module or class raises when it is imported or made into an InputError."""
+    try:
+        yield
     except InputError:
         raise
-    except (Exception, SystemExit) as error:  # whatever a foreign module does when it is imported
+    except (Exception, SystemExit) as error:
         reason = str(error).partition("\n")[0]
-        raise InputError(
-            f"simulator = {text!r} cannot be loaded ({type(error).__name__}: {reason}); mend or install it."
-        ) from error
+        raise InputError(f"{what} ({type(error).__name__}: {reason}); {remedy}.") from error
 
 
 def _instance(found: Any, run: str) -> Any:

@@ -1,6 +1,7 @@
 """Simulators of others: the same maps as ours on runs of ours, what their arguments change, and what they do wrong."""
 
 import importlib
+import threading
 from pathlib import Path
 
 import healpy
@@ -197,6 +198,34 @@ def test_what_a_simulator_fails_to_say_of_itself_is_refused(name, error):
     kind = type("Survey", (), {"simulate": lambda self, seed, effects=(): {}, name: property(fails)})
     with refused(f"Survey.{name}", error.__name__):
         source_of(config.load(MODEL), kind())
+
+
+@pytest.mark.parametrize("error", [ValueError("first\nsecond"), SystemExit(3), None])
+def test_a_class_that_cannot_be_made_is_refused(error):
+    """Its error was passed on bare where the class itself is given; None: it needs more than the description."""
+
+    class Survey:
+        def __init__(self, description, *more, **needed):
+            if error is not None:
+                raise error
+
+        def simulate(self, seed):
+            return {}
+
+    class Demanding(Survey):
+        def __init__(self, description, beams):
+            super().__init__(description)
+
+    kind = Demanding if error is None else Survey
+    with refused(kind.__name__, type(error or TypeError()).__name__) as caught:
+        source_of(config.load(MODEL), kind)
+    assert "second" not in str(caught.value)
+
+
+def test_a_class_that_cannot_be_sent_to_workers_is_refused():
+    kind = type("Survey", (), {"simulate": lambda self, seed: {}, "lock": threading.Lock()})
+    with refused(kind, "_thread.lock"):
+        source_of(config.load(MODEL), kind)
 
 
 def test_an_effect_that_is_declared_twice_is_one():
