@@ -4,6 +4,7 @@ import difflib
 import inspect
 import os
 import pkgutil
+import re
 import sys
 from collections import UserDict
 from collections.abc import Mapping
@@ -87,6 +88,8 @@ def _flaw(kind: type[Effect]) -> str | None:
     for key in ("name", "unit", "cause", "signature"):
         if not isinstance(getattr(kind, key, None), str) or not getattr(kind, key):
             return f"has no {key}: it needs a text"
+    if re.fullmatch(r"\w[\w-]*", kind.name) is None:  # what is told apart from a channel, a width or a file
+        return f"has name = {kind.name!r}: it needs letters, digits, _ and - alone, - not as the first"
     if getattr(kind, "scope", None) not in ("channel", "common"):
         return 'has no scope: it needs "channel" or "common"'
     fit: Any = kind.parametrization
@@ -96,6 +99,9 @@ def _flaw(kind: type[Effect]) -> str | None:
     for key, value, largest in (("step", step, float_info.max), ("max_amplitude", fit.max_amplitude, inf)):
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= largest:
             return f"has {key} = {value!r}: it needs a number above 0"
+    rank: Any = kind.rank
+    if isinstance(rank, bool) or not isinstance(rank, Real) or not isfinite(rank):
+        return f"has rank = {rank!r}: it needs a number"
     if taken := sorted(f.name for f in fields(kind) if callable(getattr(Effect, f.name, None))):
         return f"has the parameter {taken[0]}, which is a method of every effect: it needs another name"
     bounds: Any = kind.bounds
