@@ -194,6 +194,7 @@ def diagnose(
     ] = None,
     case: Annotated[str | None, Option(help="Name of the case; default: that of the model.")] = None,
     without: Annotated[list[str] | None, Option(metavar="EFFECT", help="Do not propose it; repeatable.")] = None,
+    only: Annotated[list[str] | None, Option(metavar="EFFECT", help="Propose no other; repeatable.")] = None,
     including: Including = None,
     simulations: Simulations = None,
     quick: Annotated[bool, Option("--quick", help="First verdict, from fewer simulations.")] = False,
@@ -215,8 +216,9 @@ def diagnose(
     where, run = chosen(workers, scheduler), config.load(model)
     chosen_settings = DiagnosisSettings.quick if quick else DiagnosisSettings
     settings = chosen_settings(
-        without=tuple(without or ()), including=tuple(including or ()), simulations=simulations, controls=controls
-    )
+        without=tuple(without or ()), only=tuple(only or ()), including=tuple(including or ()),
+        simulations=simulations, controls=controls,
+    )  # fmt: skip
     if dry_run:
         if (number := processes(where)) is not None:
             run = replace(run, compute=replace(run.compute, workers=max(number, 1)))

@@ -40,6 +40,9 @@ class DiagnosisSettings:
     including
         Names of effects that are candidates although they are proposed on request alone; those of a ``library`` that is
         given always are.
+    only
+        Names of the effects that alone are candidates, those on request too; empty: all but ``without``. A result has
+        the others in ``without``, and this empty.
     simulations
         Simulations for the covariance of the data vector, which then is that of the sample; None: ``sims_per_element``
         for each of its elements.
@@ -202,6 +205,7 @@ class DiagnosisSettings:
     without: tuple[str, ...] = ()
     library: Library | None = None
     including: tuple[str, ...] = ()
+    only: tuple[str, ...] = ()
     simulations: int | None = None
     controls: int = 0
     alpha: float = 0.05

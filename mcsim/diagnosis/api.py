@@ -110,7 +110,7 @@ def diagnose(
         raise InputError("the data are None; give a folder with the observed maps, the maps, or a table of spectra.")
     run, source = loaded(model)
     settings = settings_of(settings, DiagnosisSettings)
-    wanted, (settings, library, asked) = settings.controls, _with_library(settings)
+    wanted, (settings, library, asked) = settings.controls, _with_library(settings, run)
     if output is not None:
         output = folders.user_path(output)
         folders.writable(output)
@@ -118,7 +118,7 @@ def diagnose(
     processes = run.compute.workers if workers is None else workers
     load_ahead(processes)
     run, analysis, table, given = _analysed(run, source, data, settings, library, wanted)
-    check_asked(analysis, asked)
+    _check_candidates(analysis, asked)
     task: Callable[[Job], NDArray[np.float64]] = data_vectors if table is None else table
     maps = checked_maps(analysis.model, given) if given else []
     if output is not None:
@@ -159,18 +159,33 @@ def diagnose(
     return diagnosis
 
 
-def _with_library(settings: DiagnosisSettings) -> tuple[DiagnosisSettings, systematics.Library, tuple[str, ...]]:
-    """Return settings that name effects of a library, that library, and what is asked for; refuse other names."""
+def _with_library(
+    settings: DiagnosisSettings, run: config.RunConfig
+) -> tuple[DiagnosisSettings, systematics.Library, tuple[str, ...]]:
+    """Return settings that name effects of a library, that library, and what is asked for; refuse other names.
+
+    What ``only`` does not name is in ``without``, nuisances of the run among it that are in no library.
+    """
     known = systematics.catalogue() if settings.library is None else systematics.checked(settings.library)
-    asked = tuple(settings.including) if settings.library is None else (*settings.including, *known)
+    asked = (*settings.only, *settings.including, *(() if settings.library is None else known))
     kinds = {name: systematics.get(name, known) for name in (*settings.without, *asked)}
-    if both := {kinds[name].name for name in settings.without} & {kinds[name].name for name in settings.including}:
-        raise InputError(f"{min(both)} is asked for and left out (--with and --without); choose one of them.")
+    only, including, without = (
+        {kinds[name].name for name in names} for names in (settings.only, settings.including, settings.without)
+    )
+    for option, names in (("--only", only), ("--with", including)):
+        if both := names & without:
+            raise InputError(f"{min(both)} is asked for and left out ({option} and --without); choose one of them.")
+    if only and (others := including - only):
+        raise InputError(
+            f"{min(others)} is asked for (--with), but is none of those that alone are proposed (--only); name it "
+            "with --only."
+        )
     known = {**known, **{kinds[name].name: kinds[name] for name in asked}}
-    including = tuple(sorted({kinds[name].name for name in asked if not kinds[name].proposed}))
-    named = tuple(kinds[name].name for name in settings.including)
-    without = tuple(kinds[name].name for name in settings.without)
-    return replace(settings, without=without, including=including, library=None, controls=0), known, named
+    if only:
+        without = {*known, *(systematics.called(one.effect) for one in run.nuisances)} - only
+    on_request = {kinds[name].name for name in asked if not kinds[name].proposed}
+    named = replace(settings, without=tuple(sorted(without)), including=tuple(sorted(on_request)), only=())
+    return replace(named, library=None, controls=0), known, tuple(only | including)
 
 
 def describe(
@@ -182,9 +197,9 @@ def describe(
     maps would be warned of: sky power that the model lacks.
     """
     run, source = loaded(model)
-    count, (settings, library, asked) = settings.controls, _with_library(settings)
+    count, (settings, library, asked) = settings.controls, _with_library(settings, run)
     run, analysis, table, maps = _analysed(run, source, data, settings, library, count)
-    check_asked(analysis, asked)
+    _check_candidates(analysis, asked)
     if maps:
         checked_maps(analysis.model, maps)
     campaign.check_count(analysis, settings.simulations)
@@ -246,11 +261,6 @@ def _analysed(
         analysis = spectra_table.analysis_of_spectra(run, table, settings.without, threads, settings, library)
     else:
         analysis = analysis_of(run, settings.without, threads, settings, library, source)
-    if not analysis.candidates:
-        raise InputError(
-            "no effect of the library can be found in these data: none applies to the model and is not left out; leave "
-            "fewer out (--without), or give others (library)."
-        )
     if table is None:
         check_pixels(analysis.model, analysis.elements)
     if table is None and source is None:
@@ -262,6 +272,16 @@ def _analysed(
     if table is None:
         warn_of_parts_of_pixels(analysis.model)
     return run, analysis, table, given
+
+
+def _check_candidates(analysis: Analysis, asked: Sequence[str]) -> None:
+    """Raise InputError if an effect that is asked for is no candidate, or nothing is."""
+    check_asked(analysis, asked)
+    if not analysis.candidates:
+        raise InputError(
+            "no effect of the library can be found in these data: none applies to the model and is not left out; leave "
+            "fewer out (--without), or give others (library)."
+        )
 
 
 def _warnings(analysis: Analysis) -> tuple[str, ...]:

@@ -120,6 +120,9 @@ scan = { kind = "hit_averaged", model = "wmap", sample_period_s = 157.8, line_of
     sizes = [int(mcsim(*command, *more)[1].splitlines()[0].split()[-1]) for more in ((), asked.split())]
     assert sizes[1] == sizes[0] + 2  # cosine and sine have a matched filter each
     assert_refused(mcsim(*command, "--with", "orbital_dipol"), "orbital_dipol", "orbital_dipole")
+    alone = ("--only", "beam_width", "--only", "orbital_dipole", "--without")
+    assert int(mcsim(*command, *alone[:-1])[1].splitlines()[0].split()[-1]) < sizes[0]
+    assert_refused(mcsim(*command, *alone, "beam_width"), "beam_width", "--only", "--without")
     first, whole = (mcsim("diagnose", "small.toml", "data", "--dry-run", *more)[1] for more in (["--quick"], []))
     assert int(first.split("at most ")[1].split()[0]) < int(whole.split("at most ")[1].split()[0])
     assert_refused(mcsim("diagnose", "small.toml", "data"), "-o")

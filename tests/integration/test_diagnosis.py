@@ -319,6 +319,8 @@ def test_the_cost_of_a_diagnosis_counts_the_effects_on_request(small):
     # Of a library that is given all effects are proposed; the level of the noise has a matched filter in each channel.
     library = {"gain_spin": systematics.get("gain_spin")}
     assert size(DiagnosisSettings(simulations=400, library=library)) == size(least) - 2 + 4
+    assert size(DiagnosisSettings(simulations=400, only=("noise_level",))) == size(least)
+    assert size(DiagnosisSettings(simulations=400, only=("noise_level", "gain_spin"))) == size(least) + 4
     with refused("gain_spinn", "gain_spin"):
         api.describe(small.run, replace(least, including=("gain_spinn",)))
     with refused("gain_spin", "--with", "--without"):
@@ -344,6 +346,8 @@ def test_an_effect_that_is_asked_for_is_not_left_out_in_silence(small, tmp_path)
         api.describe(small.run, DiagnosisSettings(including=(str(broken),)))
     with refused("mapmaking_convergence", "differencing"):
         api.describe(small.run, DiagnosisSettings(including=("mapmaking_convergence",)))
+    with refused("mapmaking_convergence", "differencing"):
+        api.describe(small.run, DiagnosisSettings(only=("mapmaking_convergence",)))
     with refused("library", "--without"):
         api.describe(small.run, DiagnosisSettings(without=tuple(systematics.catalogue())))
 

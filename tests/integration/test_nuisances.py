@@ -210,5 +210,5 @@ def test_a_nuisance_of_a_file_is_a_candidate(run):
     analysis = small_analysis(replace(run, nuisances=(one,)))
     assert ("gain_step", "V1") in {candidate.identity for candidate in analysis.candidates}
     assert "gain_step" in dict(analysis.library)
-    settings, *_ = api._with_library(DiagnosisSettings(without=(FILE,)))
+    settings, *_ = api._with_library(DiagnosisSettings(without=(FILE,)), run)
     assert settings.without == ("gain_step",)

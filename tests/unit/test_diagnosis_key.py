@@ -10,12 +10,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mcsim import config
+from mcsim import config, systematics
 from mcsim.datavector.candidate import Candidate
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis import api
 from mcsim.reconstruction import simulated_scores
 from mcsim.support import code, resources
+from refusals import refused
 
 SOURCE = """
 from mcsim.systematics import Effect
@@ -23,6 +24,7 @@ from mcsim.systematics import Effect
 
 class Tilt(Effect):
     name, scope, unit, step = "tilt", "common", "K", 0.1
+    cause = signature = "A test."
 
     def sky(self, sky, site, draw):
         return sky * (1.0 + self.amplitude)
@@ -137,3 +139,33 @@ def test_name_seed_and_number_of_realizations_do_not_count(plugin):
     effect = importlib.import_module("effects_of_a_user").Tilt
     other = replace(RUN, name="other", ensemble=replace(RUN.ensemble, seed=9, realizations=3))
     assert key(effect, run=other) == key(effect)
+
+
+@pytest.mark.parametrize("asked", [("beam_width",), ("gain_drift", "sidelobe_pickup"), ("FILE", "beam_width")])
+def test_effects_that_alone_are_proposed_are_those_that_are_not_left_out(asked, plugin):
+    """And so have one key; ``sidelobe_pickup`` is proposed on request alone."""
+    names = tuple(str(plugin) if name == "FILE" else name for name in asked)
+    known = {**systematics.catalogue(), **{systematics.get(name).name: None for name in names}}
+    others = tuple(name for name in known if name not in {systematics.get(name).name for name in names})
+    only, _, _ = found = api._with_library(DiagnosisSettings(only=names), RUN)
+    assert found[:2] == api._with_library(DiagnosisSettings(without=others, including=names), RUN)[:2]
+    assert (only.without, only.only) == (tuple(sorted(others)), ())
+    assert set(found[2]) == set(known) - set(others)
+
+
+def test_a_nuisance_of_a_file_is_left_out_by_effects_that_alone_are_proposed(plugin):
+    run = replace(RUN, nuisances=(config.Nuisance(effect=str(plugin), width=(1e-3,)),))
+    found, _, _ = api._with_library(DiagnosisSettings(only=("beam_width",)), run)
+    assert "tilt" in found.without
+
+
+def test_what_effects_that_alone_are_proposed_contradict_is_refused():
+    known = {"gain_drift": systematics.get("gain_drift"), "calibration": systematics.get("calibration")}
+    for settings, named in (
+        ({"only": ("beam_widht",)}, ("beam_widht", "beam_width")),
+        ({"only": ("beam_width",), "library": known}, ("beam_width", *known)),
+        ({"only": ("beam_width", "gain_drift"), "without": ("gain_drift",)}, ("gain_drift", "--only", "--without")),
+        ({"only": ("beam_width",), "including": ("gain_spin",)}, ("gain_spin", "--only", "--with")),
+    ):
+        with refused(*named):
+            api._with_library(DiagnosisSettings(**settings), RUN)

@@ -447,7 +447,7 @@ def test_a_file_is_the_same_effect(stage, kind, tmp_path, monkeypatch):
     assert (kind_.name, kind_.scope, kind_.proposed) == (name, "channel", False)
     variables = [key for key in vars(made) if not key.startswith("_") and key not in ("amplitude", "signature")]
     assert {key: getattr(kind_, key) for key in variables} == {key: getattr(made, key) for key in variables}
-    settings, library, _ = api._with_library(DiagnosisSettings(including=(str(path),)))
+    settings, library, _ = api._with_library(DiagnosisSettings(including=(str(path),)), config.load(MODEL))
     assert (settings.including, library[name]) == ((name,), kind_)
     run = {**MODEL, "effect": [{"name": str(path), "channel": "V1", "amplitude": 1.0}]}
     loaded = config.load(run)
