@@ -14,7 +14,7 @@ from mcsim.comparison import report
 from mcsim.comparison.catalogue import library
 from mcsim.comparison.effects import effects_of
 from mcsim.comparison.looks import look
-from mcsim.comparison.output import REPORT, RESULT, check_output
+from mcsim.comparison.output import REPORT, RESULT, check_output, place
 from mcsim.comparison.pairs import ChannelPair, Comparison, Given, given, read
 from mcsim.comparison.prediction import PRECISION, Set
 from mcsim.comparison.result import UNMADE, ChannelResult, ComparisonResult, DifferenceResult, Verdict
@@ -69,7 +69,8 @@ def compare(
         Without one, only differences of the maps themselves are tried: units, calibration, monopole, dipole, order of
         the pixels, exchanged files.
     output
-        Folder for ``compare.json`` and ``report.html``, in place of those of the same case; None: nothing is written.
+        Folder for ``compare.json`` and ``report.html``, in place of those of the same case and sides; None: nothing is
+        written.
     accuracy
         Rms of a difference over that of the sky up to which maps that differ in no known way are called identical.
     quiet
@@ -116,9 +117,10 @@ def compare(
     if output is not None:
         output = folders.user_path(output)
         folders.writable(output)
+    paths: tuple[str, ...] = ()
     if isinstance(a, str | Path) and isinstance(b, str | Path):
-        case = Path(b).absolute().name
-        check_output(output, (a, b), case)
+        case, paths = Path(b).absolute().name, (place(a), place(b))
+        check_output(output, paths, case)
         sides = read(a, b, model, nthreads)
     elif isinstance(a, str | Path) or isinstance(b, str | Path):
         raise InputError("one side is a folder and the other arrays; give two folders or two lists of maps.")
@@ -129,14 +131,14 @@ def compare(
             )
         run = model if isinstance(model, config.RunConfig) else config.load(model)
         case = run.name
-        check_output(output, (), case)
+        check_output(output, paths, case)
         sides = given(a, b, run, nthreads)
     found = []
     with reporting("channels compared", float(len(sides.pairs)), "channels", quiet) as progress:
         for number, pair in enumerate(sides.pairs):
             found.append(_channel(pair, sides, accuracy))
             progress(number + 1.0)
-    result = ComparisonResult(case, tuple(found), sides.not_compared, sides.shown)
+    result = ComparisonResult(case, tuple(found), sides.not_compared, sides.shown, paths)
     if output is not None:
         text = json.dumps(result.to_dict(), indent=1, allow_nan=False) + "\n"
         with folders.filling(target := Path(output)), folders.replacing(target, RESULT) as scratch:

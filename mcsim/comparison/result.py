@@ -184,6 +184,8 @@ class ComparisonResult:
         Maps that one side, or the model, lacks.
     frame
         Frame of the maps, "ecliptic", "galactic" or "equatorial"; None if neither a model nor headers say one alone.
+    sides
+        Paths of A and B; empty for arrays.
 
     Examples
     --------
@@ -199,6 +201,7 @@ class ComparisonResult:
     channels: tuple[ChannelResult, ...]
     not_compared: tuple[NotCompared, ...] = ()
     frame: str | None = None
+    sides: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -227,6 +230,7 @@ class ComparisonResult:
         return {
             "schema": 1,
             "case": self.case,
+            "sides": list(self.sides),
             "verdict": self.verdict,
             "frame": self.frame,
             "accuracy": self.accuracy,
