@@ -53,7 +53,7 @@ def _beam(channel: str, spec: config.Beam, lmax: int) -> beams.Beam:
             major, minor = spec.fwhm_major_arcmin, spec.fwhm_minor_arcmin
             return beams.Beam.elliptical(major, minor, angle_deg=spec.angle_deg, lmax=lmax, mmax=spec.m_max)
         case config.BeamMap():
-            beam = beams.Beam.from_map(load_beam_map(channel, spec), lmax, spec.m_max)
+            beam = beams.Beam.from_map(load_beam_map(channel, spec, lmax), lmax, spec.m_max)
             return beam.rotated(np.deg2rad(spec.angle_deg))
         case config.BeamBlm():
             file = config.channel_path(spec.path, channel)
@@ -63,8 +63,8 @@ def _beam(channel: str, spec: config.Beam, lmax: int) -> beams.Beam:
             return beams.Beam.from_window(file, lmax, extension=spec.extension, column=spec.column)
 
 
-def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:
-    """Return the beam map of a channel."""
+def load_beam_map(channel: str, spec: config.BeamMap, lmax: int | None = None) -> beams.BeamMap:
+    """Return the beam map of a channel whose maps have degrees up to ``lmax``."""
     return beams.read_map(
         config.channel_path(spec.path, channel),
         pixel_deg=spec.pixel_deg,
@@ -72,6 +72,7 @@ def load_beam_map(channel: str, spec: config.BeamMap) -> beams.BeamMap:
         centre=spec.centre_pixel,
         plane=spec.plane,
         projection=spec.projection,
+        lmax=lmax,
     )
 
 

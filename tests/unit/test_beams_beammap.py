@@ -1,5 +1,7 @@
 """Beam maps: known beams drawn into FITS images come back as their known coefficients."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -366,6 +368,18 @@ def test_steps_in_radians_without_a_unit_are_asked_about(tmp_path) -> None:
         read_map(write(tmp_path / "steps.fits", small_image(), pixel_deg=step))
     assert read_map(write(tmp_path / "said.fits", small_image(), pixel_deg=step, CUNIT1="deg")).pixel_rad < 1e-4
     assert read_map(tmp_path / "steps.fits", pixel_deg=0.04).pixel_rad == pytest.approx(step)
+
+
+def test_wide_beams_with_steps_in_radians_without_a_unit_are_told_of(tmp_path) -> None:
+    """One of 2.6 degrees was one of 2.7 arcmin, without a word; whether it may be is known by the maps alone."""
+    step = 12.0 * np.radians(0.04)
+    bare, said = (write(tmp_path / f"{name}.fits", small_image(), pixel_deg=step, **unit)
+                  for name, unit in (("bare", {}), ("said", {"CUNIT1": "deg"})))  # fmt: skip
+    spec = config.BeamMap(path=str(bare))
+    with pytest.warns(UserWarning, match="CUNIT1.*lmax = 200.*pixel_deg"):
+        load_beam_map("W1", spec, 200)
+    for unambiguous in (spec, replace(spec, pixel_deg=0.48), replace(spec, path=str(said))):
+        load_beam_map("W1", unambiguous, 900 if unambiguous is spec else 200)
 
 
 def test_truncated_empty_and_foreign_files_are_refused(tmp_path) -> None:

@@ -1,5 +1,6 @@
 """From a two-dimensional beam map to b_lm, exact on the curved sky."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import ceil, pi, sin
@@ -23,6 +24,7 @@ PEAK_BOX = 8
 DEFAULT_CUT_DEG = 3.5
 SMALLEST_CUT_PIXELS = 2
 NARROWEST_DEG = 1 / 30  #: of a beam whose header gives no unit: a narrower one may be one of up to 2 deg, in radians
+HARDLY = 0.3  #: width in radians times lmax up to which a beam without a unit acts so little that it may be 57 times it
 _UNITS = ("CUNIT1", "CUNIT2")
 
 
@@ -85,13 +87,15 @@ def read_map(
     centre: tuple[float, float] | None = None,
     plane: int = 0,
     projection: Projection = "equidistant",
+    lmax: int | None = None,
 ) -> BeamMap:
     """Read a beam map from the first image of a FITS file.
 
     ``path``: FITS file (may be gzipped); column = beam x (in-scan), row = beam y. ``pixel_deg``, ``cut_deg``,
     ``centre``: as for :meth:`mcsim.instrument.beams.Beam.from_map`. ``plane``: plane of a three-dimensional image (a
     WMAP beam file has side A, its noise, side B, its noise). ``projection``: see :class:`BeamMap`. Values are those at
-    the pixel centres; of means over the pixels take :meth:`BeamMap.without_pixel_window`.
+    the pixel centres; of means over the pixels take :meth:`BeamMap.without_pixel_window`. ``lmax``: highest degree
+    of the maps that the beam is for, at which steps without a unit are doubted.
 
     Notes
     -----
@@ -104,19 +108,25 @@ def read_map(
     step_deg = _pixel_deg(header, path) if pixel_deg is None else pixel_deg
     beam_map = placed(image, step_deg, cut_deg=cut_deg, centre=centre, projection=projection, origin=str(path))
     if pixel_deg is None and not any(str(header.get(axis, "")).strip() for axis in _UNITS):
-        _check_unit(beam_map, step_deg, path)
+        _check_unit(beam_map, step_deg, path, lmax)
     return beam_map
 
 
-def _check_unit(beam_map: BeamMap, step: float, path: str | Path) -> None:
-    """Raise InputError if a header without a unit gives a beam so narrow in degrees that it may be in radians."""
+def _check_unit(beam_map: BeamMap, step: float, path: str | Path, lmax: int | None) -> None:
+    """Raise InputError if a header without a unit gives a beam so narrow in degrees that it may be in radians.
+
+    Warn of one that is wider, but hardly acts up to ``lmax``.
+    """
     pixels = 2.0 * np.sqrt(np.count_nonzero(beam_map.image > 0.5 * beam_map.image.max()) / pi)
+    said = (
+        f"{path} has steps of {step:g} without a unit (CDELT1, CUNIT1), and a beam {60.0 * pixels * step:.2g} arcmin "
+        f"wide if they are in degrees, or {60.0 * np.degrees(pixels * step):.4g} arcmin if in radians"
+    )
+    remedy = f"give pixel_deg = {step:g} or {np.degrees(step):g}"
     if pixels * step < NARROWEST_DEG:
-        raise InputError(
-            f"{path} has steps of {step:g} without a unit (CDELT1, CUNIT1), and a beam {60.0 * pixels * step:.2g} "
-            f"arcmin wide if they are in degrees, or {60.0 * np.degrees(pixels * step):.2g} arcmin if in radians; give "
-            f"pixel_deg = {step:g} or {np.degrees(step):g}"
-        )
+        raise InputError(f"{said}; {remedy}")
+    if lmax is not None and np.radians(pixels * step) * lmax < HARDLY:
+        warnings.warn(f"{said}; up to lmax = {lmax} the first hardly changes a map: {remedy}.", stacklevel=2)
 
 
 def placed(
