@@ -53,7 +53,15 @@ def _beam(channel: str, spec: config.Beam, lmax: int) -> beams.Beam:
             major, minor = spec.fwhm_major_arcmin, spec.fwhm_minor_arcmin
             return beams.Beam.elliptical(major, minor, angle_deg=spec.angle_deg, lmax=lmax, mmax=spec.m_max)
         case config.BeamMap():
-            beam = beams.Beam.from_map(load_beam_map(channel, spec, lmax), lmax, spec.m_max)
+            beam_map = load_beam_map(channel, spec, lmax)
+            if abs(beam_map.edge_over_peak) > beams.PEDESTAL:
+                warnings.warn(
+                    f"channel[{channel}].beam: the response is still {beam_map.edge_over_peak:.2g} of the peak where "
+                    f"its map ends or is cut (cut_deg = {spec.cut_deg:g}), and nothing beyond is simulated; raise "
+                    "cut_deg, or subtract what is no beam.",
+                    stacklevel=1,
+                )
+            beam = beams.Beam.from_map(beam_map, lmax, spec.m_max)
             return beam.rotated(np.deg2rad(spec.angle_deg))
         case config.BeamBlm():
             file = config.channel_path(spec.path, channel)

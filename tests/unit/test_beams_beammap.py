@@ -1,5 +1,6 @@
 """Beam maps: known beams drawn into FITS images come back as their known coefficients."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from harmonics import legendre
 from mcsim import config
 from mcsim.instrument.beams import Beam, BeamMap, blm_of_map, find_centre, read_map
 from mcsim.plot.look import look_at_beams
-from mcsim.simulation.channels import load_beam_map
+from mcsim.simulation.channels import load_beam, load_beam_map
 from refusals import refused
 
 PIXEL_DEG = 0.04
@@ -380,6 +381,17 @@ def test_wide_beams_with_steps_in_radians_without_a_unit_are_told_of(tmp_path) -
         load_beam_map("W1", spec, 200)
     for unambiguous in (spec, replace(spec, pixel_deg=0.48), replace(spec, path=str(said))):
         load_beam_map("W1", unambiguous, 900 if unambiguous is spec else 200)
+
+
+def test_a_beam_that_is_cut_where_it_is_not_over_is_told_of(tmp_path) -> None:
+    """One of 4 degrees lost an eighth of its solid angle by the default of cut_deg, without a word."""
+    theta, phi = directions(261, (130.0, 130.0))
+    path = write(tmp_path / "wide.fits", lobe(theta, phi, 120.0), pixel_deg=0.08, CUNIT1="deg")
+    channel = config.load("tiny").channels[0]
+    said = pytest.warns(UserWarning, match=r"channel\[demo\].*cut_deg = 3.5")
+    for cut_deg, told in ((3.5, said), (9.0, nullcontext())):
+        with told:
+            load_beam(replace(channel, beam=config.BeamMap(path=str(path), cut_deg=cut_deg)), 40)
 
 
 def test_truncated_empty_and_foreign_files_are_refused(tmp_path) -> None:

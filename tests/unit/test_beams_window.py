@@ -161,7 +161,10 @@ def test_beams_of_a_run_are_shown_as_far_as_their_files_reach(tmp_path):
     wmap_text(tmp_path)
     y, x = np.mgrid[-12:13, -12:13] * 1.0
     fits.writeto(tmp_path / "map.fits", np.exp(-(x**2 + y**2) / 4))
-    beams = ('kind = "window", path = "ampl_bl_W1.txt"', 'kind = "map", path = "map.fits", pixel_deg = 1.0')
+    beams = (
+        'kind = "window", path = "ampl_bl_W1.txt"',
+        'kind = "map", path = "map.fits", pixel_deg = 1.0, cut_deg = 8.0',
+    )
     for number, beam in enumerate(beams):
         text = f'name = "W"\nsky = {{ spectrum = "wmap7", lmax = {LMAX} }}\nmap = {{ nside = 32 }}\n[[channel]]\n'
         path = tmp_path / f"run{number}.toml"

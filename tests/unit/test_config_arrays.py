@@ -176,7 +176,7 @@ def test_an_object_may_stand_under_its_key() -> None:
 
 
 def test_arrays_under_other_keys_become_lists() -> None:
-    image = np.exp(-(np.hypot(*np.mgrid[-20:21, -20:21]) ** 2) / 50)
+    image = np.exp(-(np.hypot(*np.mgrid[-20:21, -20:21]) ** 2) / 40)
     spec = {"kind": "map", "path": image, "pixel_deg": 1.0, "cut_deg": 15.0, "centre_pixel": np.array([20.0, 20.0])}
     run = config.load(table(beam=spec))
     assert run.channels[0].beam.centre_pixel == (20.0, 20.0)

@@ -24,6 +24,7 @@ PEAK_BOX = 8
 DEFAULT_CUT_DEG = 3.5
 SMALLEST_CUT_PIXELS = 2
 NARROWEST_DEG = 1 / 30  #: of a beam whose header gives no unit: a narrower one may be one of up to 2 deg, in radians
+PEDESTAL = 0.01  #: response about the edge of a map over its peak from which on it is told of
 HARDLY = 0.3  #: width in radians times lmax up to which a beam without a unit acts so little that it may be 57 times it
 _UNITS = ("CUNIT1", "CUNIT2")
 
@@ -67,6 +68,15 @@ class BeamMap:
         shape = (rows + 2 * PEAK_BOX, columns + 2 * PEAK_BOX)
         window = np.outer(np.sinc(np.fft.fftfreq(shape[0])), np.sinc(np.fft.rfftfreq(shape[1])))
         return replace(self, image=np.fft.irfft2(np.fft.rfft2(self.image, shape) / window, shape)[:rows, :columns])
+
+    @property
+    def edge_over_peak(self) -> float:
+        """Mean response of the last pixels about the centre that are used, over the largest one."""
+        (rows, columns), (x, y) = self.image.shape, self.centre
+        cut = float(_PROJECTIONS[self.projection][0](np.asarray(self.cut_rad))) / self.pixel_rad
+        last = max(min(cut, x, y, columns - 1 - x, rows - 1 - y), 1.0)
+        radius = np.hypot(np.arange(columns) - x, (np.arange(rows) - y)[:, None])
+        return float(self.image[(radius > last - 1.0) & (radius <= last)].mean() / self.image.max())
 
     def values(self, theta: NDArray[np.float64], phi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Interpolate the response (cubic) at angles from the centre and azimuths from x towards y; 0 outside."""

@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcsim.instrument.beams.beam import Beam
-from mcsim.instrument.beams.beammap import BeamMap, solid_angle_values
+from mcsim.instrument.beams.beammap import PEDESTAL, BeamMap, solid_angle_values
 
 DEFAULT_ELLS = (2, 10, 20, 50, 100, 200, 300, 500, 700, 1000, 1500, 2000, 3000)
 BAND_LIMITED_WINDOW = 1e-5
 CIRCULAR_AXIS_RATIO = 1e-3
-PEDESTAL = 0.01  #: response about the edge of a map over its peak from which on it is told of
 _LISTED_ORDERS = 6
 _RADII = 400
 _AZIMUTHS = 180
@@ -99,16 +98,8 @@ def summarize(beam: Beam, beam_map: BeamMap | None = None, ells: tuple[int, ...]
         negative_over_positive=float(abs(value[value < 0].sum()) / value[value > 0].sum()),
         centroid_arcmin=(float(offset.real) * _ARCMIN, -float(offset.imag) * _ARCMIN),
         ells=tuple(ell for ell in ells if ell <= beam.lmax),
-        edge_over_peak=0.0 if beam_map is None else _about_the_edge(beam_map) / peak,
+        edge_over_peak=0.0 if beam_map is None else beam_map.edge_over_peak,
     )
-
-
-def _about_the_edge(beam_map: BeamMap) -> float:
-    """Return the mean response of a map on a circle just within its edge, or within what is used of it."""
-    (rows, columns), (x, y) = beam_map.image.shape, beam_map.centre
-    inside = min(x, y, columns - 1 - x, rows - 1 - y) * beam_map.pixel_rad
-    phi = np.arange(_AZIMUTHS) * 2 * np.pi / _AZIMUTHS
-    return float(np.mean(beam_map.values(np.full(_AZIMUTHS, 0.97 * min(inside, beam_map.cut_rad)), phi)))
 
 
 def format_summary(summary: BeamSummary) -> str:
@@ -141,7 +132,8 @@ def format_summary(summary: BeamSummary) -> str:
     if abs(summary.edge_over_peak) > PEDESTAL:
         lines.append(
             f"note                 the response is still {summary.edge_over_peak:.2g} of the peak at the edge of the "
-            "map: solid angle and B_l are those of all that it holds; subtract what is no beam"
+            "map, or at its cut_deg: solid angle and B_l are those of all within; use more of it, or subtract what is "
+            "no beam"
         )
     window, table = summary.window, summary.ratios
     orders = [m for m in range(1, min(beam.mmax, _LISTED_ORDERS) + 1) if np.any(table[m] > 0)]
