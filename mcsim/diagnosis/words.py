@@ -63,10 +63,12 @@ def tested(result: DiagnosisResult) -> str:
     by = "" if result.agreement is None else f" by {result.agreement.simulator}"
     if "worth" in result.provenance:
         by += f", whose shrunk covariance is worth {result.provenance['worth']} of a sample covariance"
+    candidates = f"{len(result.candidates)} candidate effects, alone and up to {result.settings.max_effects} together"
+    if len(result.candidates) == 1:
+        candidates = "one candidate effect"
     return (
         f"{len(result.elements)} elements of the data vector, {result.test.dimension} of them independent, measured "
-        f"from {source}; {result.simulations} simulations of the model{by}; "
-        f"{len(result.candidates)} candidate effects, alone and up to {result.settings.max_effects} together"
+        f"from {source}; {result.simulations} simulations of the model{by}; {candidates}"
     )
 
 

@@ -108,6 +108,8 @@ def test_the_least_likely_comparison_and_amplitudes_over_their_errors_are_told(t
     assert "effect        offset of V: 6 arcmin; amplitude/error −12" in lines
     assert any("measured from 2 maps (2 splits); 500 simulations" in line for line in lines)
     assert any("χ² = 50 for 30 degrees of freedom" in line for line in lines)
+    alone = SimpleNamespace(**(vars(found) | {"candidates": found.candidates[:1]}))
+    assert words.tested(alone).endswith("; one candidate effect")
     assert "(1 splits)" not in words.tested(SimpleNamespace(**(vars(found) | {"elements": found.elements[::2]})))
 
 
