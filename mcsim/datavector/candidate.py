@@ -221,10 +221,15 @@ def parts_of(candidates: Sequence[Candidate], members: Sequence[int], found: Fit
 def beyond(candidates: Sequence[Candidate], members: Sequence[int], found: Fit) -> float:
     """Return how far a fit is beyond the bounds of its effects, in standard deviations; infinite if it is not theirs.
 
-    The nearest effects within their bounds have a chi^2 that is larger by the square of it.
+    The nearest effects within their bounds have a chi^2 that is larger by the square of it. Standard deviations are
+    those with the effects in the data, as far as it is known what these scatter along their own responses.
     """
-    parts = parts_of(candidates, members, found)
-    return float(np.sqrt(sum(candidates[member].beyond(*part) ** 2 for member, *part in parts)))
+    distances = []
+    for member, theta, covariance in parts_of(candidates, members, found):
+        acting = candidates[member].acting
+        grown = 1.0 if acting is None else 1.0 + max(acting.own, 0.0)
+        distances.append(candidates[member].beyond(theta, grown * covariance))
+    return float(np.linalg.norm(distances))
 
 
 def lost(candidates: Sequence[Candidate], members: Sequence[int], found: Fit, n: int) -> float:

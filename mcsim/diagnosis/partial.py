@@ -52,7 +52,7 @@ class PartialSearch:
             if best < 0 or pvalues[best] > settings.partial_level:
                 break
             together = (*members, best)
-            exact = self._together(candidates, t, together)
+            exact = self.together(candidates, t, together)
             if exact is not None and self._beside(exact, candidates, members)[best] <= settings.partial_level:
                 members, t = together, exact
             else:
@@ -83,13 +83,14 @@ class PartialSearch:
             less[new] = lost(candidates, together, fit, search.null.dof)
         return search.beside(row, less)[0]
 
-    def _together(self, candidates: Sequence[Candidate], t: Matrix, members: tuple[int, ...]) -> Matrix | None:
+    def together(self, candidates: Sequence[Candidate], t: Matrix, members: Sequence[int]) -> Matrix | None:
         """Return templates that are exact for effects that act together, at about their fitted amplitudes.
 
         Strong effects change their own responses and each other's. None if one can have no such amplitude, or the
         amplitudes diverge round by round.
         """
-        columns, null, settings = columns_of(candidates, members), self.data.context.null, self.data.context.settings
+        columns, settings = columns_of(candidates, members), self.data.context.settings
+        null = self.data.context.null.with_extra_covariance(*scatters_of(candidates, members))
         fitted = null.fit(self.data.x, t[:, columns])
         with if_possible():
             for _ in range(settings.joint_rounds):

@@ -133,6 +133,21 @@ class Refiner:
         """Draw what members of a set scatter together at their amplitudes there; return True if anything changed."""
         return cross(self.data, now.candidates, now.crossed, self._fitted(now, members)[1])
 
+    def _join(self, now: Responses, members: Sequence[int]) -> bool:
+        """Let templates of several members be those of all at once, if that is more than the sum of each by itself.
+
+        A beam that is wider in one channel, for instance, hides part of the sky that another effect is seen in. Return
+        True if anything changed.
+        """
+        null, columns = self.context.null, columns_of(now.candidates, members)
+        if len(members) < 2 or (exact := PartialSearch(self.data).together(now.candidates, now.t, members)) is None:
+            return False
+        change = (exact - now.t)[:, columns] @ self._fitted(now, members)[0].amplitudes
+        if np.linalg.norm(null.whiten_templates(change[:, None])) <= self.context.settings.nonlinear_sigma:
+            return False
+        now.t[:, columns] = exact[:, columns]
+        return True
+
     def _completed(self, now: Responses, found: Attribution) -> Attribution:
         """Return the attribution once each member of its best sets has been simulated, at the fitted amplitude."""
         for _ in range(self.context.settings.refine_rounds):
@@ -141,6 +156,7 @@ class Refiner:
             untried = {part[0]: part for part in parts if part[0] not in now.done}
             changed = [self._simulate(now, *part) for part in untried.values()]
             changed += [self._simulate_in_place(now, *place) for one in best for place in self._alike(now, one)]
+            changed += [self._join(now, one.members) for one in best[:1]]
             changed += [self._cross(now, one.members) for one in best]
             if not any(changed):
                 break
@@ -186,7 +202,7 @@ class Refiner:
             for _ in range(self.context.settings.refine_rounds):
                 for index in members:
                     self._simulate_in_place(beside, tuple(one for one in members if one != index), index)
-                if not self._cross(beside, members):
+                if not (self._join(beside, members) | self._cross(beside, members)):
                     break
             yield beside, self._completed(beside, self._attribute(beside))
 

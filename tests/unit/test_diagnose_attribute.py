@@ -341,7 +341,7 @@ def detected(bench: Bench, x: np.ndarray, exact=lambda t, members: t, candidates
     context = SimpleNamespace(null=bench.null, calibration=bench.calibration, settings=DiagnosisSettings())
 
     class Straight(PartialSearch):
-        def _together(self, candidates, t, members):
+        def together(self, candidates, t, members):
             return exact(t, members)
 
     return Straight(SimpleNamespace(context=context, x=x)).run(bench.t, candidates or bench.candidates)
