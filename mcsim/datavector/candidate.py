@@ -1,6 +1,6 @@
 """Candidates: effects that may be in the data, the response of the data vector to each, and what a fit says of them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -256,10 +256,10 @@ def scatters_of(candidates: Sequence[Candidate], members: Sequence[int]) -> list
     return own + [one.crossed[other] for one, other in pairs if other in one.crossed]
 
 
-def scattering(candidates: Sequence[Candidate]) -> list[int]:
-    """Return the candidates whose scatter is known, by themselves or beside one that draws its pattern."""
-    beside = {other for one in candidates for other in one.crossed}
-    return [place for place, one in enumerate(candidates) if one.scatter is not None or place in beside]
+def crossed_by(candidates: Sequence[Candidate], members: Iterable[int]) -> list[int]:
+    """Return the candidates of which it is known what they scatter together with members; not their own scatter."""
+    beside = {other for member in members for other in candidates[member].crossed}
+    return [place for place in sorted(beside) if candidates[place].scatter is None]
 
 
 def coordinates_of(candidates: Sequence[Candidate], members: Sequence[int], effects: Sequence[Effect]) -> Vector:

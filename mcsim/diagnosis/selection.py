@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from scipy import special
 
-from mcsim.datavector.candidate import Candidate, beyond, columns_of, scattering, scatters_of
+from mcsim.datavector.candidate import Candidate, beyond, columns_of, crossed_by, scatters_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.consistency import Findings
 from mcsim.diagnosis.subsets import EXHAUSTIVE, Subsets, chunks
@@ -273,24 +273,33 @@ class Selection:
     def searches(self) -> list[Subsets]:
         """Return a search of sets without a member whose scatter is known, and of each combination of few such members.
 
-        Combinations of candidates that exclude each other are left out.
+        Those with which these scatter together are in it, or in none of its sets. Combinations of candidates that
+        exclude each other are left out.
         """
-        most = min(SCATTERED, self.settings.max_effects)
-        sets = [members for size in range(most + 1) for members in combinations(scattering(self.candidates), size)]
-        return [self.search(own) for own in sets if len({self.candidates[k].identity for k in own}) == len(own)]
+        scatters = [index for index, candidate in enumerate(self.candidates) if candidate.scatter is not None]
+        most = self.settings.max_effects
+        drawn = [own for size in range(min(SCATTERED, most) + 1) for own in combinations(scatters, size)]
+        beside = [(own, crossed_by(self.candidates, own)) for own in drawn]
+        sets = [(*own, *more) for own, others in beside for k in range(most + 1) for more in combinations(others, k)]
+        identities = [{self.candidates[member].identity for member in members} for members in sets]
+        return [
+            self.search(members)
+            for members, own in zip(sets, identities, strict=True)
+            if len(own) == len(members) <= most
+        ]
 
     def search(self, members: Sequence[int]) -> Subsets:
         """Return the search of sets with all of the members whose scatter is known."""
-        every = set(scattering(self.candidates))
-        own = tuple(member for member in members if member in every)
+        drawn = [member for member in members if self.candidates[member].scatter is not None]
+        beside = set(crossed_by(self.candidates, drawn))
+        own = (*drawn, *(member for member in members if member in beside))
         columns, known = [candidate.columns for candidate in self.candidates], scatters_of(self.candidates, own)
-        drawn = [member for member in own if self.candidates[member].scatter is not None]
         wide = self.null.with_extra_covariance(*known)
-        beside = variance_beside(self.null, self.t, columns, drawn, known)
+        variance = variance_beside(self.null, self.t, columns, drawn, known)
         groups, y = wide.whiten_groups(self.t, columns), wide.whiten(self.x)
         # What others add to the scatter is less over the scatter of these.
         each = self.candidates if not known else list(self._acting_beside(wide, columns))
-        return Subsets(wide, y, groups, each, self.calibration, self.settings, own, beside)
+        return Subsets(wide, y, groups, each, self.calibration, self.settings, own, variance)
 
     def _acting_beside(self, wide: SimulatedGaussian, columns: Groups) -> Iterator[Candidate]:
         """Yield the candidates with what they add to the scatter of data of another distribution."""

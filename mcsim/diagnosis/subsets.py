@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 from scipy import special
 
-from mcsim.datavector.candidate import Candidate, scattering
+from mcsim.datavector.candidate import Candidate, crossed_by
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.stats.detection import log_evidence
 from mcsim.stats.gaussian import COLLINEAR, SimulatedGaussian, Tolerated, WhitenedTemplates
@@ -51,7 +51,8 @@ class Subsets:
     candidates: Sequence[Candidate]
     calibration: Calibration
     settings: DiagnosisSettings = field(default_factory=DiagnosisSettings)
-    # Candidates whose scatter is in ``null``: subsets contain these, and no other one whose scatter is known.
+    # Candidates whose scatter is in ``null``: subsets have these, and no other one whose scatter, alone or beside them,
+    # is known.
     scattered: tuple[int, ...] = ()
     variance: Vector | None = None  # of held-out draws of these along each candidate, over what ``null`` says, (C,)
 
@@ -95,8 +96,9 @@ class Subsets:
 
     @cached_property
     def _free(self) -> Rows:
-        """Return the candidates whose scatter is not known."""
-        return np.setdiff1d(np.arange(len(self.candidates)), scattering(self.candidates))
+        """Return the candidates whose scatter is not known, alone or beside those that are in all subsets."""
+        unknown = np.flatnonzero([candidate.scatter is None for candidate in self.candidates])
+        return np.setdiff1d(unknown, crossed_by(self.candidates, self.scattered))
 
     def rows(self, size: int) -> Iterator[Rows]:
         """Yield all subsets without exclusive members, shape (M, size), all of the same ranks."""

@@ -1,12 +1,13 @@
 """Products of maps: what a pattern that is drawn and a signal that is not add to them together."""
 
 from dataclasses import dataclass
+from itertools import combinations
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from mcsim.datavector.candidate import Candidate, scattering, scatters_of
+from mcsim.datavector.candidate import Candidate, crossed_by, scatters_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.crossed import cross, together
 from mcsim.diagnosis.selection import Selection, attribute
@@ -118,7 +119,8 @@ def test_a_pair_suffices_with_what_both_scatter_together(data, known):
     candidates = [*CANDIDATES]
     if known:
         cross(data, candidates, {}, parts(*amplitudes))
-    assert scattering(candidates) == ([0, 1] if known else [0])
+    assert crossed_by(candidates, (0,)) == ([1] if known else [])
+    assert crossed_by(candidates, (1,)) == []
     assert len(scatters_of(candidates, (0, 1))) == (2 if known else 1)
     assert len(scatters_of(candidates, (0,))) == 1
     calibration = calibrate(data.null, data.null.whiten_groups(response, [(0,), (1,)]))
@@ -130,3 +132,17 @@ def test_a_pair_suffices_with_what_both_scatter_together(data, known):
         assert sorted(map(sorted, sets)) == [[0, 1]]  # in one search alone
         suffices += [set(one.members) for one in attribute(selection).explanations] == [{0, 1}]
     assert suffices >= 18 if known else suffices <= 2
+
+
+def test_every_set_is_searched_once_whatever_scatters_together(data):
+    crossed = {place: np.ones((P, SKIES)) for place in (1, 2)}
+    drawn = Candidate(Drawn, "A", (0,), scatter=np.ones((P, SKIES)), crossed=crossed)
+    candidates = [drawn, *(Candidate(Steady, name, (k,)) for k, name in enumerate("ABC", 1))]
+    t = np.random.default_rng(35).normal(size=(P, 4))
+    calibration = calibrate(data.null, data.null.whiten_groups(t, [one.columns for one in candidates]))
+    searches = Selection(data.null, data.x, t, candidates, calibration).searches
+    for size in (1, 2, 3, 4):
+        sets = [tuple(sorted(row)) for search in searches for rows in search.rows(size) for row in rows.tolist()]
+        assert sorted(sets) == list(combinations(range(4), size))
+    (wide,) = [search for search in searches if search.scattered == (0, 2)]
+    assert {tuple(sorted(row)) for rows in wide.rows(3) for row in rows.tolist()} == {(0, 2, 3)}
