@@ -250,10 +250,14 @@ def lost(candidates: Sequence[Candidate], members: Sequence[int], found: Fit, n:
 
 
 def scatters_of(candidates: Sequence[Candidate], members: Sequence[int]) -> list[Matrix]:
-    """Return the scatter of the responses of members where it is known, and behind it what they scatter together."""
+    """Return the scatter of the responses of members where it is known, and behind it what they scatter together.
+
+    That of one which draws its pattern with several others is of the same draws, which add up.
+    """
     own = [one for one in (candidates[member].scatter for member in members) if one is not None]
-    pairs = ((candidates[member], other) for member in members for other in members)
-    return own + [one.crossed[other] for one, other in pairs if other in one.crossed]
+    crossed = [candidates[member].crossed for member in members]
+    together = [[beside[other] for other in members if other in beside] for beside in crossed]
+    return own + [np.sum(parts, axis=0) for parts in together if parts]
 
 
 def crossed_by(candidates: Sequence[Candidate], members: Iterable[int]) -> list[int]:

@@ -310,16 +310,23 @@ class SameSkies:
         return self._simulated(self._jobs([*without_repeats(self.noise, found), *found], False, None))
 
     def pair(
-        self, found: Sequence[config.Effect], skies: int, constrained: bool, negative: bool = False
+        self,
+        found: Sequence[config.Effect],
+        skies: int,
+        constrained: bool,
+        negative: bool = False,
+        acting: Sequence[config.Effect] = (),
     ) -> tuple[Matrix, Matrix]:
         """Return data vectors of the same skies without effects and with them, which the observed maps have too.
 
-        ``negative``: of constrained skies with the other sign.
+        ``negative``: of constrained skies with the other sign. ``acting``: effects that the simulator must know, too.
         """
         noise = without_repeats(self.noise, found)
         there = [*noise, *found]
         jobs = [replace(job, negative=negative) for job in self._jobs(there, constrained, skies, there=there)]
         same = self._jobs(noise, constrained, skies, there=there)
+        if acting and self.analysis.source_of(acting, given_sky=constrained) is None:
+            jobs = [replace(job, source=None) for job in jobs]
         same = [replace(job, source=jobs[0].source, negative=negative) for job in same]
         return self._simulated(same), self._simulated(jobs)
 

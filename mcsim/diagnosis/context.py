@@ -183,8 +183,11 @@ class DataSet(ABC, Generic[Data]):
         before, after = self.pair_extended(found, skies)
         return after - before
 
-    def typical(self, found: Sequence[config.Effect], skies: int) -> Matrix:
-        """Return the changes of :meth:`respond_extended` in skies that nothing constrains, the same for all effects."""
+    def typical(self, found: Sequence[config.Effect], skies: int, acting: Sequence[config.Effect]) -> Matrix:
+        """Return the changes of :meth:`respond_extended` in skies that nothing constrains, the same for all effects.
+
+        Patterns are the same as well if one simulator draws them: that of all that are ``acting``.
+        """
         return self.respond_extended(found, skies)
 
     def responses(self, candidates: Sequence[Candidate], skies: int) -> Iterator[tuple[Candidate, Matrix]]:

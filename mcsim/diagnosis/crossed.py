@@ -17,11 +17,14 @@ MOVED = 0.1  #: share of coordinates by which they move from which on what they 
 Crossings = dict[tuple[int, int], list[Part]]  #: amplitudes at which pairs, by their places, were drawn together
 
 
-def cross(data: DataSet, candidates: list[Candidate], drawn: Crossings, parts: Sequence[Part]) -> bool:
+def cross(
+    data: DataSet, candidates: list[Candidate], drawn: Crossings, parts: Sequence[Part], kept: Sequence[int] = ()
+) -> bool:
     """Let candidates that draw their patterns know what these do together with others; return True if anything changed.
 
     ``parts`` are members of a fit with their amplitudes, at which they are simulated unless they were, as the pairs
-    ``drawn`` say, to which they are added.
+    ``drawn`` say, to which they are added. Of two that are ``kept`` nothing changes: another set, at whose amplitudes
+    they are drawn, has both.
 
     Notes
     -----
@@ -32,7 +35,7 @@ def cross(data: DataSet, candidates: list[Candidate], drawn: Crossings, parts: S
     changed = False
     for pair in _pairs(candidates, parts):
         places = pair[0][0], pair[1][0]
-        if places in drawn and not any(map(_has_moved, drawn[places], pair)):
+        if set(places) <= set(kept) or (places in drawn and not any(map(_has_moved, drawn[places], pair))):
             continue
         drawn[places] = pair
         one, scatter = candidates[places[0]], None
@@ -52,12 +55,15 @@ def together(data: DataSet, drawn: config.Effect, other: config.Effect) -> Matri
     The first one draws its pattern. None if all of it is little, as few skies say.
     """
     null, settings = data.context.null, data.context.settings
+    acting = [drawn, other]
     for skies in (settings.constrained_skies, settings.scatter_skies):
-        both, *each = (data.typical(own, skies) for own in ([drawn, other], [drawn], [other]))
+        both, *each = (data.typical(own, skies, acting) for own in (acting, [drawn], [other]))
         rows = min(map(len, (both, *each)))
         scatter = data.scatter(both[:rows] - sum(one[:rows] for one in each))
         if np.linalg.norm(null.whiten_templates(scatter[: len(data.x)])) <= LITTLE:
             return None
+        if rows != skies:  # there are no others
+            break
     return scatter
 
 

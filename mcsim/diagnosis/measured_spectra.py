@@ -82,6 +82,11 @@ class MeasuredSpectra(DataSet[Spectra]):
             after = np.concatenate([after, *self.ask(after_jobs(analysis, found, more))])
         return before, after
 
+    def typical(self, found: Sequence[config.Effect], skies: int, acting: Sequence[config.Effect]) -> Matrix:
+        """Return the changes by effects in the skies of the reference alone, whatever number is asked for."""
+        before, after = super().pair_extended(found, skies)
+        return after - before
+
     def _is_known(self, changes: Matrix) -> bool:
         """Return True if the mean of changes, shape (skies, p), is known well beside the errors of the data.
 

@@ -149,9 +149,11 @@ def _actions(data: DataSet, refined: Refined, one: Explanation) -> Iterator[Acti
 
 def _beside(data: DataSet, refined: Refined, one: Explanation, member: int, table: config.Effect) -> Iterator[Matrix]:
     """Yield what a member that draws its pattern does together with others of a set, at their amplitudes."""
-    candidates = refined.candidates
+    candidates, found = refined.candidates, list[Matrix]()
     for other, *at in parts_of(candidates, one.members, one.fit):
         if other in candidates[member].crossed:
             beside = candidates[other].table(candidates[other].detected(*at))
             if (scatter := together(data, table, beside)) is not None:
-                yield scatter
+                found.append(scatter)
+    if found:  # of the same draws
+        yield np.sum(found, axis=0)

@@ -72,9 +72,12 @@ class ObservedMaps(DataSet[Sequence[Map]]):
             return self.of_reference(found)
         return self.same_skies.pair(found, skies, kind == "constrained")
 
-    def typical(self, found: Sequence[config.Effect], skies: int) -> Matrix:
-        """Return the changes by effects in skies that nothing constrains, shape (skies, p + E)."""
-        before, after = self.same_skies.pair(found, skies, constrained=False)
+    def typical(self, found: Sequence[config.Effect], skies: int, acting: Sequence[config.Effect]) -> Matrix:
+        """Return the changes by effects in skies that nothing constrains, shape (skies, p + E).
+
+        They are those of another program only if it can add all that are ``acting``.
+        """
+        before, after = self.same_skies.pair(found, skies, constrained=False, acting=acting)
         return after - before
 
     def of_reference(self, found: Sequence[config.Effect]) -> tuple[Matrix, Matrix]:

@@ -114,7 +114,9 @@ class Refiner:
         detected = PartialSearch(self.data).run(now.t, now.candidates) if found.verdict == "unknown" else None
         if detected is not None and len(detected.members) <= self.context.settings.max_effects:
             done = {member: now.done.get(member) for member in detected.members}
-            beside = Responses(now.linear, detected.templates.copy(), [*now.candidates], done)
+            beside = Responses(
+                now.linear, detected.templates.copy(), [*now.candidates], done, crossed=now.crossed.copy()
+            )
             together = self._completed(beside, self._attribute(beside))
             if together.explanations:
                 now, found, detected = beside, together, None
@@ -129,9 +131,9 @@ class Refiner:
         fit = null.fit(self.data.x, now.t[:, columns_of(now.candidates, members)])
         return fit, list(parts_of(now.candidates, members, fit))
 
-    def _cross(self, now: Responses, members: Sequence[int]) -> bool:
-        """Draw what members of a set scatter together at their amplitudes there; return True if anything changed."""
-        return cross(self.data, now.candidates, now.crossed, self._fitted(now, members)[1])
+    def _cross(self, now: Responses, members: Sequence[int], kept: Sequence[int] = ()) -> bool:
+        """Draw what members of a set, not both of ``kept``, scatter together there; return True if anything changed."""
+        return cross(self.data, now.candidates, now.crossed, self._fitted(now, members)[1], kept)
 
     def _join(self, now: Responses, members: Sequence[int]) -> bool:
         """Let templates of several members be those of all at once, if that is more than the sum of each by itself.
@@ -157,7 +159,9 @@ class Refiner:
             changed = [self._simulate(now, *part) for part in untried.values()]
             changed += [self._simulate_in_place(now, *place) for one in best for place in self._alike(now, one)]
             changed += [self._join(now, one.members) for one in best[:1]]
-            changed += [self._cross(now, one.members) for one in best]
+            changed += [
+                self._cross(now, one.members, best[0].members if place else ()) for place, one in enumerate(best)
+            ]
             if not any(changed):
                 break
             found = self._attribute(now)

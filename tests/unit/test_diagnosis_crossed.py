@@ -1,6 +1,6 @@
 """Products of maps: what a pattern that is drawn and a signal that is not add to them together."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from types import SimpleNamespace
 
@@ -48,7 +48,8 @@ class Squares:
         self.context = SimpleNamespace(null=self.null, settings=DiagnosisSettings())
         self.x, self.asked = np.zeros(P), []
 
-    def typical(self, tables, skies):
+    def typical(self, tables, skies, acting):
+        assert [table.name for table in acting] == ["drawn", "steady"]
         self.asked.append([table.name for table in tables])
         parts = {"steady": SIGNAL, "drawn": PATTERNS[:skies]}
         maps = sum(float(table.parameters["amplitude"]) * parts[table.name] for table in tables)
@@ -87,6 +88,14 @@ def test_what_they_scatter_is_left_out_where_it_is_little(data):
     assert len(data.asked) == 3  # in few skies
 
 
+def test_skies_whose_number_is_given_are_simulated_once(data, monkeypatch):
+    """As those of measured spectra, which are as many as there are of reference."""
+    typical = data.typical
+    monkeypatch.setattr(data, "typical", lambda own, skies, acting: typical(own, 24, acting))
+    assert together(data, *tables(0.5, 3.0)).shape == (P, 24)
+    assert len(data.asked) == 3
+
+
 def test_a_candidate_knows_what_it_does_with_others_until_these_move(data):
     candidates, drawn = [*CANDIDATES], {}
     assert cross(data, candidates, drawn, parts(0.5, 3.0))
@@ -99,6 +108,25 @@ def test_a_candidate_knows_what_it_does_with_others_until_these_move(data):
     assert candidates[0].crossed[1] == pytest.approx(together(data, *tables(0.5, 6.0)))
     assert cross(data, candidates, drawn, parts(0.01, 0.1))
     assert not candidates[0].crossed
+
+
+def test_a_pair_that_two_sets_have_is_drawn_where_the_first_has_it(data):
+    candidates, drawn = [*CANDIDATES], {}
+    assert cross(data, candidates, drawn, parts(0.5, 3.0))
+    assert not cross(data, candidates, drawn, parts(0.5, 6.0), kept=(2, 1, 0))
+    assert candidates[0].crossed[1] == pytest.approx(together(data, *tables(0.5, 3.0)))
+    assert cross(data, candidates, drawn, parts(0.5, 6.0), kept=(0, 2))
+
+
+def test_one_pattern_scatters_with_several_at_once(data):
+    """Of two opposite signals there is nothing; as if each had a pattern of its own, there was twice one of them."""
+    own = data.scatter(PATTERNS * SIGNAL)
+    one = replace(CANDIDATES[0], crossed={1: own, 2: -own})
+    candidates = [one, *(Candidate(Steady, name, (k,)) for k, name in enumerate("AB", 1))]
+    (_, both) = scatters_of(candidates, (0, 1, 2))
+    assert not both.any()
+    (_, single) = scatters_of(candidates, (2, 0))
+    assert single == pytest.approx(-own)
 
 
 def test_two_that_draw_or_two_that_do_not_are_not_crossed(data):

@@ -89,7 +89,7 @@ class Instrument:
         known = {"null": self.null, "templates": self.t, "calibration": self.calibration, "settings": self.settings}
         context = SimpleNamespace(bank=bank, knows=lambda table: False, **known)
         own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter, "changes_sky": lambda tables: False}
-        own["typical"] = lambda tables, skies: sum(self.respond([table], skies) for table in tables)
+        own["typical"] = lambda tables, skies, acting: sum(self.respond([table], skies) for table in tables)
         own["dipole_snr"] = lambda tables: float(tables[0].channel in self.crossed)
         groups = self.null.whiten_groups(self.t, [one.columns for one in self.candidates])
         gap = global_test(self.null, x, groups, self.calibration)

@@ -50,6 +50,31 @@ def test_effects_are_asked_for_at_once_and_then_known(monkeypatch: pytest.Monkey
     assert asked[2:] == [[""], ["a"]]
 
 
+@pytest.mark.parametrize("listed", [("a",), ("a", "b")])
+def test_what_two_effects_draw_together_is_of_one_simulator(monkeypatch: pytest.MonkeyPatch, listed: Any) -> None:
+    """One that knows a alone would draw another pattern of it than mcsim does of both."""
+
+    def source_of(found: Any, given_sky: bool = False) -> str | None:
+        return "another program" if {one.name for one in found} <= {*listed} else None
+
+    def jobs(own: Any, found: Any, constrained: bool, skies: int, there: Any = ()) -> list[Any]:
+        return [replace(job, simulated=str(len(found)), source=source_of(there or found))]
+
+    def ask(wanted: Any) -> list[np.ndarray]:
+        asked.extend(one.source for one in wanted)
+        return [np.zeros((3, 2)) for _ in wanted]
+
+    asked: list[Any] = []
+    run = config.load(two_channels("patterns"))
+    job = analysis_of(run, without=tuple(name for name in systematics.catalogue() if name != "beam_width")).job(run)
+    monkeypatch.setattr(SameSkies, "_jobs", jobs)
+    both = [config.Effect(name="a"), config.Effect(name="b")]
+    for found in (both, both[:1], both[1:]):
+        skies = SameSkies(SimpleNamespace(source_of=source_of), ask, ())  # type: ignore[arg-type]
+        skies.pair(found, 3, False, acting=both)
+    assert asked == ["another program" if len(listed) > 1 else None] * 6
+
+
 def test_keys_tell_all_skies_apart_and_hold_none_of_them() -> None:
     """At nside 512 every one of hundreds of keys held 8 MB of a sky."""
     run = config.load(two_channels("keys"))
