@@ -96,6 +96,9 @@ class Refiner:
             if not any(changed):
                 break
             found = self._attribute(now)
+        # Members of sets that were named were simulated at once; one by one they no longer are what they were.
+        joined = [self._join(now, one.members) for one in reversed(first.explanations[:2] if sets else ())]
+        found = self._attribute(now) if any(joined) else found
         now, found = self._with_smaller(now, self._completed(now, found))
         if found.verdict == "unknown" and not (found.faint or sets):
             now, found = self._with_sets(now, found, Responses(t, t.copy(), list(candidates)))
@@ -142,6 +145,8 @@ class Refiner:
         True if anything changed.
         """
         null, columns = self.context.null, columns_of(now.candidates, members)
+        if any(now.candidates[member].nuisance for member in members):  # its template is that of its prior
+            return False
         if len(members) < 2 or (exact := PartialSearch(self.data).together(now.candidates, now.t, members)) is None:
             return False
         change = (exact - now.t)[:, columns] @ self._fitted(now, members)[0].amplitudes
@@ -152,16 +157,16 @@ class Refiner:
 
     def _completed(self, now: Responses, found: Attribution) -> Attribution:
         """Return the attribution once each member of its best sets has been simulated, at the fitted amplitude."""
-        for _ in range(self.context.settings.refine_rounds):
-            best = found.explanations[:2]
+        rounds = self.context.settings.refine_rounds
+        while best := found.explanations[:2]:
             parts = [part for one in best for part in parts_of(now.candidates, one.members, one.fit)]
             untried = {part[0]: part for part in parts if part[0] not in now.done}
             changed = [self._simulate(now, *part) for part in untried.values()]
             changed += [self._simulate_in_place(now, *place) for one in best for place in self._alike(now, one)]
-            changed += [self._join(now, one.members) for one in best[:1]]
-            changed += [
-                self._cross(now, one.members, best[0].members if place else ()) for place, one in enumerate(best)
-            ]
+            if (rounds := rounds - 1) >= 0:
+                changed.append(self._join(now, best[0].members))
+                changed.append(self._cross(now, best[0].members))
+                changed += [self._cross(now, one.members, kept=best[0].members) for one in best[1:]]
             if not any(changed):
                 break
             found = self._attribute(now)

@@ -14,21 +14,9 @@ from mcsim.diagnosis.responses import Responses
 from mcsim.diagnosis.selection import Selection, attribute
 from mcsim.errors import InputError
 from mcsim.stats.gaussian import SimulatedGaussian
-from mcsim.stats.look_elsewhere import calibrate, global_test
-from mcsim.systematics import Bound, Effect, Parametrization
-
-P = 50
-
-
-@dataclass(frozen=True, kw_only=True)
-class Push(Effect):
-    """A response along a direction of its own."""
-
-    name = "push"
-    scope = "channel"
-    unit = "push"
-    cause = signature = ""
-    step = 1.0
+from mcsim.stats.look_elsewhere import calibrate
+from mcsim.systematics import Bound, Parametrization
+from pushes import Instrument, P, Push
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,53 +36,6 @@ class Resolved(Parametrization):
 
     def constrained(self, coordinates, precision):
         return coordinates * (coordinates @ precision @ coordinates > 25.0)
-
-
-class Instrument:
-    """Three effects on evidence of unit normals, with a response that is no straight line."""
-
-    def __init__(self, bend: float, cross: float, noise: float | None = None) -> None:
-        self.noise, self.crossed = noise, ""
-        rng = np.random.default_rng(21)
-        directions = np.linalg.qr(rng.normal(size=(P, 5)))[0].T
-        self.t, self.sideways = directions[:3].T, directions[3:]
-        self.bend, self.cross = bend, cross
-        self.null = SimulatedGaussian.from_simulations(rng.normal(size=(900, P)))
-        self.candidates = [Candidate(Push, name, (k,)) for k, name in enumerate("ABC")]
-        self.calibration = calibrate(self.null, self.null.whiten_groups(self.t, [(0,), (1,), (2,)]))
-        self.curvature = np.outer(bend * self.sideways[0], [1.0, 0.0, 0.0])
-        self.analysis: list[dict[str | None, float]] = []
-        self.settings = DiagnosisSettings()
-
-    def response(self, a: float, b: float) -> np.ndarray:
-        return self.t[:, :2] @ [a, b] + self.bend * a**2 * self.sideways[0] + self.cross * a * b * self.sideways[1]
-
-    def respond(self, tables, skies: int) -> np.ndarray:
-        amplitudes = {table.channel: float(table.parameters["amplitude"]) for table in tables}
-        self.analysis.append(amplitudes)
-        return np.tile(self.response(amplitudes.get("A", 0.0), amplitudes.get("B", 0.0)), (skies, 1))
-
-    def pair(self, tables) -> tuple[np.ndarray, np.ndarray] | None:
-        """Noise grows by a factor, if there is one."""
-        if self.noise is None:
-            return None
-        before = np.random.default_rng(22).normal(size=(8, P))
-        return before, self.noise * before + self.respond(tables, 8)
-
-    def scatter(self, changes: np.ndarray) -> np.ndarray:
-        return (changes - changes.mean(axis=0)).T / np.sqrt(len(changes) - 1.0)
-
-    def refined(self, x: np.ndarray, sets=()):
-        bank = SimpleNamespace(curvature=self.curvature)
-        known = {"null": self.null, "templates": self.t, "calibration": self.calibration, "settings": self.settings}
-        context = SimpleNamespace(bank=bank, knows=lambda table: False, **known)
-        own = {"respond": self.respond, "pair": self.pair, "scatter": self.scatter, "changes_sky": lambda tables: False}
-        own["typical"] = lambda tables, skies, acting: sum(self.respond([table], skies) for table in tables)
-        own["dipole_snr"] = lambda tables: float(tables[0].channel in self.crossed)
-        groups = self.null.whiten_groups(self.t, [one.columns for one in self.candidates])
-        gap = global_test(self.null, x, groups, self.calibration)
-        data = SimpleNamespace(context=context, x=x, realizations=1, gap=gap, **own)
-        return Refiner(data).run(self.t, self.candidates, sets)
 
 
 @pytest.mark.parametrize("amplitude", [15.0, -15.0])
@@ -302,6 +243,37 @@ def test_two_that_change_each_other_are_simulated_together_before_they_are_named
     assert best.fit.chi2 == pytest.approx(0.0, abs=0.1)
     both = found.templates[:, :2] @ best.fit.amplitudes
     assert both @ instrument.sideways[1] == pytest.approx(3.0, abs=0.1)
+
+
+def test_what_a_pair_is_at_once_is_not_lost_where_others_are_tried():
+    """A is simulated by itself again. The products of A and B are 12 standard deviations; C is 3 from both together."""
+    instrument = Instrument(bend=0.0, cross=12.0 / (12.0 * 14.0))
+    x = instrument.response(12.0, 14.0)
+    t = instrument.refined(x).templates.copy()
+    near = x + 3.0 * instrument.sideways[0]
+    t[:, 2] = near / np.linalg.norm(near)
+    found = instrument.refined(x, [(0,)], t).attribution
+    assert [one.members for one in found.explanations] == [(0, 1), (2,)]
+
+
+def test_the_template_of_a_prior_is_not_that_of_all_at_once():
+    instrument = Instrument(bend=0.0, cross=12.0 / (12.0 * 14.0))
+    x = instrument.response(12.0, 14.0)
+    for nuisance in (False, True):
+        candidates = [instrument.candidates[0], replace(instrument.candidates[1], nuisance=nuisance)]
+        data = SimpleNamespace(context=instrument.context, x=x, respond=instrument.respond)
+        now = Responses(instrument.t, instrument.t.copy(), candidates)
+        assert Refiner(data)._join(now, (0, 1)) is not nuisance
+        assert np.array_equal(now.t, instrument.t) is nuisance
+
+
+def test_every_member_of_a_named_set_is_simulated_whatever_the_rounds():
+    instrument = Instrument(bend=0.0, cross=0.0)
+    instrument.settings = DiagnosisSettings(refine_rounds=0)
+    assert [one.members for one in instrument.refined(instrument.response(12.0, 14.0)).attribution.explanations] == [
+        (0, 1)
+    ]
+    assert [list(one) for one in instrument.analysis] == [["A"], ["B"]]
 
 
 def test_what_is_none_of_the_library_stays_unknown_beside_two_that_are():
