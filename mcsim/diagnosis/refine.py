@@ -117,9 +117,8 @@ class Refiner:
         detected = PartialSearch(self.data).run(now.t, now.candidates) if found.verdict == "unknown" else None
         if detected is not None and len(detected.members) <= self.context.settings.max_effects:
             done = {member: now.done.get(member) for member in detected.members}
-            beside = Responses(
-                now.linear, detected.templates.copy(), [*now.candidates], done, crossed=now.crossed.copy()
-            )
+            beside = Responses(now.linear, detected.templates.copy(), [*now.candidates], done)
+            beside.crossed.update(now.crossed)
             together = self._completed(beside, self._attribute(beside))
             if together.explanations:
                 now, found, detected = beside, together, None
@@ -145,9 +144,8 @@ class Refiner:
         True if anything changed.
         """
         null, columns = self.context.null, columns_of(now.candidates, members)
-        if any(now.candidates[member].nuisance for member in members):  # its template is that of its prior
-            return False
-        if len(members) < 2 or (exact := PartialSearch(self.data).together(now.candidates, now.t, members)) is None:
+        single = len(members) < 2 or any(now.candidates[member].nuisance for member in members)  # or that of a prior
+        if single or (exact := PartialSearch(self.data).together(now.candidates, now.t, members)) is None:
             return False
         change = (exact - now.t)[:, columns] @ self._fitted(now, members)[0].amplitudes
         if np.linalg.norm(null.whiten_templates(change[:, None])) <= self.context.settings.nonlinear_sigma:
@@ -164,8 +162,7 @@ class Refiner:
             changed = [self._simulate(now, *part) for part in untried.values()]
             changed += [self._simulate_in_place(now, *place) for one in best for place in self._alike(now, one)]
             if (rounds := rounds - 1) >= 0:
-                changed.append(self._join(now, best[0].members))
-                changed.append(self._cross(now, best[0].members))
+                changed += [self._join(now, best[0].members), self._cross(now, best[0].members)]
                 changed += [self._cross(now, one.members, kept=best[0].members) for one in best[1:]]
             if not any(changed):
                 break
@@ -207,11 +204,14 @@ class Refiner:
             most = max((fit.delta_chi2 for _, fit in ranked), default=0.0)
             tried += [members for members, fit in ranked if fit.delta_chi2 >= NEARLY * most]
         for members in dict.fromkeys(tried):
-            beside = now.copy()
+            beside, joined = now.copy(), False
             for _ in range(self.context.settings.refine_rounds):
                 for index in members:
-                    self._simulate_in_place(beside, tuple(one for one in members if one != index), index)
-                if not (self._join(beside, members) | self._cross(beside, members)):
+                    # One by one they would no longer be what they are at once; a scatter is that of an amplitude.
+                    if not joined or beside.candidates[index].scatter is not None:
+                        self._simulate_in_place(beside, tuple(one for one in members if one != index), index)
+                joined = self._join(beside, members)
+                if not (self._cross(beside, members) or joined):
                     break
             yield beside, self._completed(beside, self._attribute(beside))
 

@@ -256,6 +256,20 @@ def test_what_a_pair_is_at_once_is_not_lost_where_others_are_tried():
     assert [one.members for one in found.explanations] == [(0, 1), (2,)]
 
 
+def test_what_a_pair_is_at_once_is_not_undone_round_by_round(monkeypatch):
+    """Each is simulated by itself before both are, and not again."""
+    instrument = Instrument(bend=0.0, cross=40.0 / (12.0 * 14.0))
+    x = instrument.response(12.0, 14.0)
+    monkeypatch.setattr(instrument, "changes_sky", lambda tables: True)
+    monkeypatch.setattr(Refiner, "_completed", lambda self, now, found: found)
+    data = SimpleNamespace(context=instrument.context, x=x, gap=None, respond=instrument.respond, pair=instrument.pair)
+    data.changes_sky = instrument.changes_sky
+    now = Responses(instrument.t, instrument.t.copy(), instrument.candidates)
+    ((_, found),) = Refiner(data)._in_place(now, 2, [(0, 1)])
+    assert [len(one) for one in instrument.analysis] == sorted(len(one) for one in instrument.analysis)
+    assert found.explanations[0].members == (0, 1)
+
+
 def test_the_template_of_a_prior_is_not_that_of_all_at_once():
     instrument = Instrument(bend=0.0, cross=12.0 / (12.0 * 14.0))
     x = instrument.response(12.0, 14.0)
