@@ -273,8 +273,8 @@ class Selection:
     def searches(self) -> list[Subsets]:
         """Return a search of sets without a member whose scatter is known, and of each combination of few such members.
 
-        Those with which these scatter together are in it, or in none of its sets. Combinations of candidates that
-        exclude each other are left out.
+        A candidate with which these scatter together is in all sets of a search, or in none: each set is in one search
+        alone. Combinations of candidates that exclude each other are left out.
         """
         scatters = [index for index, candidate in enumerate(self.candidates) if candidate.scatter is not None]
         most = self.settings.max_effects
@@ -289,7 +289,7 @@ class Selection:
         ]
 
     def search(self, members: Sequence[int]) -> Subsets:
-        """Return the search of sets with all of the members whose scatter is known."""
+        """Return the search of sets with all of the members whose scatter is known, alone or together with these."""
         drawn = [member for member in members if self.candidates[member].scatter is not None]
         beside = set(crossed_by(self.candidates, drawn))
         own = (*drawn, *(member for member in members if member in beside))
