@@ -138,17 +138,17 @@ class Refiner:
         return cross(self.data, now.candidates, now.crossed, self._fitted(now, members)[1], kept)
 
     def _join(self, now: Responses, members: Sequence[int]) -> bool:
-        """Let templates of several members be those of all at once, if that is more than the sum of each by itself.
+        """Let templates of several members be those of all at once; return True if that changed anything.
 
-        A beam that is wider in one channel, for instance, hides part of the sky that another effect is seen in. Return
-        True if anything changed.
+        A wider beam of one channel hides some of the sky that another effect is seen in. Not of a nuisance, whose
+        template is that of a prior, nor of what scatters the data, whose amplitude is found with others round by round.
         """
-        null, columns = self.context.null, columns_of(now.candidates, members)
-        single = len(members) < 2 or any(now.candidates[member].nuisance for member in members)  # or that of a prior
+        own, columns = [now.candidates[member] for member in members], columns_of(now.candidates, members)
+        single = len(own) < 2 or any(one.nuisance or one.scatter is not None for one in own)
         if single or (exact := PartialSearch(self.data).together(now.candidates, now.t, members)) is None:
             return False
         change = (exact - now.t)[:, columns] @ self._fitted(now, members)[0].amplitudes
-        if np.linalg.norm(null.whiten_templates(change[:, None])) <= self.context.settings.nonlinear_sigma:
+        if np.linalg.norm(self.context.null.whiten_templates(change[:, None])) <= self.context.settings.nonlinear_sigma:
             return False
         now.t[:, columns] = exact[:, columns]
         return True
@@ -206,10 +206,8 @@ class Refiner:
         for members in dict.fromkeys(tried):
             beside, joined = now.copy(), False
             for _ in range(self.context.settings.refine_rounds):
-                for index in members:
-                    # One by one they would no longer be what they are at once; a scatter is that of an amplitude.
-                    if not joined or beside.candidates[index].scatter is not None:
-                        self._simulate_in_place(beside, tuple(one for one in members if one != index), index)
+                for index in () if joined else members:  # one by one they would no longer be what they are at once
+                    self._simulate_in_place(beside, tuple(one for one in members if one != index), index)
                 joined = self._join(beside, members)
                 if not (self._cross(beside, members) or joined):
                     break
