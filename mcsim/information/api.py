@@ -19,7 +19,7 @@ from mcsim.information import figure
 from mcsim.information.dense import dense, size_of
 from mcsim.information.derivatives import derivatives
 from mcsim.information.fisher import Information, Probes, group_of, stochastic
-from mcsim.information.result import Limits, limits_of
+from mcsim.information.result import Limits, check_replaced, limits_of
 from mcsim.information.settings import LimitSettings
 from mcsim.simulation import convolve
 from mcsim.simulation.channels import refuse_external
@@ -55,7 +55,8 @@ def limit(
     model
         Fiducial model of sky, beams, scan, noise, mask and splits: a run.
     output
-        Folder for ``limit.json``, ``limit.zarr`` and ``limit.png``; None: nothing is written.
+        Folder for ``limit.json``, ``limit.zarr`` and ``limit.png``, in place of earlier ones of the same model; None:
+        nothing is written.
     settings
         Effects, nuisances, levels, random probes; default: those of :class:`mcsim.LimitSettings`.
     quiet
@@ -71,7 +72,7 @@ def limit(
     ------
     InputError
         If the run has no white noise, no spectrum or no pixels, prepares its maps by more than fits that are
-        subtracted and masks of zeros and ones, or an effect is not known.
+        subtracted and masks of zeros and ones, an effect is not known, or the folder has the limit of another model.
 
     Notes
     -----
@@ -108,6 +109,7 @@ def limit(
     if output is not None:
         output = folders.user_path(output)
         folders.writable(output)
+        check_replaced(output, run.name)
     nthreads = os.cpu_count() or 1
     run, settings = _with_declared(run, settings)
     analysis, candidates = _candidates(run, settings, nthreads)

@@ -13,6 +13,7 @@ import xarray as xr
 
 from mcsim.datavector.candidate import Candidate, columns_of, numbered
 from mcsim.ensemble.datasets import write_dataset
+from mcsim.errors import InputError
 from mcsim.information.fisher import Information, ordered_pairs, variance_of_mean
 from mcsim.information.settings import LimitSettings
 from mcsim.stats.detection import snr_needed, snr_to_separate
@@ -239,6 +240,19 @@ class Limits:
                 (scratch / PICTURE).write_bytes(picture)
             text = json.dumps(self.to_json(), indent=2, ensure_ascii=False) + "\n"
             (scratch / TABLE).write_text(text, encoding="utf-8")
+
+
+def check_replaced(folder: Path, model: str) -> None:
+    """Raise InputError for a folder with the limit of another model; what cannot be read is no limit."""
+    try:
+        former = json.loads((folder / TABLE).read_text(encoding="utf-8"))["model"]
+    except (OSError, ValueError, TypeError, KeyError):
+        return
+    if former != model:
+        raise InputError(
+            f"{folder} holds the limit of {former}, and this is {model}; choose another folder with -o, or delete that "
+            "one."
+        )
 
 
 def marginalised(fisher: Matrix, nuisances: Sequence[int], widths: Sequence[float]) -> Matrix:

@@ -409,6 +409,8 @@ def test_limits_are_written_and_say_what_they_are(tmp_path) -> None:
     with xr.open_zarr(tmp_path / "out" / "limit.zarr") as stored:
         np.testing.assert_array_equal(stored.fisher, found.fisher)
     assert (tmp_path / "out" / "limit.png").stat().st_size > 10_000
+    with refused(str(tmp_path / "out"), found.model, "another"):
+        mcsim.limit(replace(model(), name="another"), tmp_path / "out")
     odd = tuple(replace(one, title="a$_$b", unit="c$_$d") for one in found.effects)  # what matplotlib cannot parse
     limit_figure(replace(found, effects=odd)).draw_without_rendering()
     assert any(line.startswith("noise_level (V1)") for line in found.lines())

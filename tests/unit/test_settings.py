@@ -15,6 +15,7 @@ from refusals import refused
     [
         (DiagnosisSettings, "without", "beam_ellipticity"),
         (DiagnosisSettings, "including", "beam_coma"),
+        (DiagnosisSettings, "only", ("beam_coma", 3)),
         (DiagnosisSettings, "simulations", -1),
         (DiagnosisSettings, "simulations", "100"),
         (DiagnosisSettings, "simulations", 100.5),
