@@ -1,7 +1,7 @@
 """Find what is detected of a gap that no set of candidates explains, and refine what acts together."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from mcsim.datavector.bent import beyond
 from mcsim.datavector.candidate import Candidate, columns_of, coordinates_of, effects_at, lost, scatters_of
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.context import DataSet
+from mcsim.diagnosis.responses import steepness
 from mcsim.diagnosis.selection import Selection
 from mcsim.stats.gaussian import Fit
 from mcsim.stats.scattered import with_drawn_scatter
@@ -87,11 +88,11 @@ class PartialSearch:
         """Return templates that are exact for effects that act together, at about their fitted amplitudes.
 
         Strong effects change their own responses and each other's. None if one can have no such amplitude, or the
-        amplitudes diverge round by round.
+        amplitudes diverge round by round. Those of a square, which would go back and forth, go halfway.
         """
         columns, settings = columns_of(candidates, members), self.data.context.settings
         null = self.data.context.null.with_extra_covariance(*scatters_of(candidates, members))
-        fitted = null.fit(self.data.x, t[:, columns])
+        fitted, rounds = null.fit(self.data.x, t[:, columns]), []
         with if_possible():
             for _ in range(settings.joint_rounds):
                 effects = effects_at(candidates, members, fitted)
@@ -104,6 +105,9 @@ class PartialSearch:
                 before, fitted = fitted.amplitudes, null.fit(self.data.x, t[:, columns])
                 if has_settled(settings, before, fitted.amplitudes, fitted.covariance, settings.settled_share):
                     return t
+                rounds.append((before, fitted.amplitudes))
+                share = steepness(rounds[-2], rounds[-1], fitted.covariance) if len(rounds) > 1 else 0.0
+                fitted = replace(fitted, amplitudes=before + (fitted.amplitudes - before) / (1.0 + share))
         return None
 
 
