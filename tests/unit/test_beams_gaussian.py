@@ -86,7 +86,7 @@ def test_large_degrees_neither_overflow_nor_warn() -> None:
         ((0.0, 0.0), {}, ("fwhm_major_arcmin", 0.0)),
         ((10.0, -1.0), {}, ("fwhm_minor_arcmin", -1.0)),
         ((float("nan"), 1.0), {}, ("fwhm_major_arcmin", "nan")),
-        ((5000.0, 10.0), {}, ("fwhm_major_arcmin", 5000.0, 1200)),
+        ((5000.0, 10.0), {}, ("fwhm_major_arcmin", 5000.0, 1200, "window")),
         ((10.0, 12.0), {}, ("fwhm_major_arcmin", 10.0, "fwhm_minor_arcmin", 12.0)),
         ((12.0, 10.0), {"angle_deg": float("inf")}, ("angle_deg", "inf")),
         ((12.0, 10.0), {"mmax": 11}, ("mmax", 11)),

@@ -18,7 +18,10 @@ def check_fwhm(width: float, name: str) -> None:
     """Raise InputError unless a full width at half maximum in arcmin is one that is offered."""
     check_number(width, name, "arcmin")
     if not 0 < width <= MAX_FWHM_ARCMIN:
-        raise InputError(f"{name} = {width} must be above 0 and at most {MAX_FWHM_ARCMIN:g} arcmin")
+        raise InputError(
+            f"{name} = {width} must be above 0 and at most {MAX_FWHM_ARCMIN:g} arcmin; correct it, or give a wider "
+            "beam by its B_l (a window) or b_lm."
+        )
 
 
 def elliptical_blm(
