@@ -141,10 +141,10 @@ class Refiner:
         """Let templates of several members be those of all at once; return True if that changed anything.
 
         A wider beam of one channel hides some of the sky that another effect is seen in. Not of a nuisance, whose
-        template is that of a prior, nor of what scatters the data, whose amplitude is found with others round by round.
+        template is that of a prior, nor of what draws its pattern, whose amplitude is found with others round by round.
         """
         own, columns = [now.candidates[member] for member in members], columns_of(now.candidates, members)
-        single = len(own) < 2 or any(one.nuisance or one.scatter is not None for one in own)
+        single = len(own) < 2 or any(one.nuisance or one.parametrization.stochastic for one in own)
         if single or (exact := PartialSearch(self.data).together(now.candidates, now.t, members)) is None:
             return False
         change = (exact - now.t)[:, columns] @ self._fitted(now, members)[0].amplitudes
