@@ -270,6 +270,17 @@ def test_what_a_pair_is_at_once_is_not_undone_round_by_round(monkeypatch):
     assert found.explanations[0].members == (0, 1)
 
 
+def test_amplitudes_of_squares_settle_at_once():
+    """By its secant, the square of 12 is that of 18 where it is simulated at 8, and that of 8 at 18."""
+    instrument = Instrument(bend=0.0, cross=0.0)
+    straight = instrument.response
+    instrument.response = lambda a, b: straight(a * abs(a) / 8.0, b)
+    x = instrument.response(12.0, 14.0)
+    data = SimpleNamespace(context=instrument.context, x=x, respond=instrument.respond)
+    exact = PartialSearch(data).together(instrument.candidates, instrument.t, (0, 1))
+    assert instrument.null.fit(x, exact[:, :2]).amplitudes == pytest.approx([12.0, 14.0], abs=0.2)
+
+
 def test_the_template_of_a_prior_is_not_that_of_all_at_once():
     instrument = Instrument(bend=0.0, cross=12.0 / (12.0 * 14.0))
     x = instrument.response(12.0, 14.0)
