@@ -88,7 +88,8 @@ class PartialSearch:
         """Return templates that are exact for effects that act together, at about their fitted amplitudes.
 
         Strong effects change their own responses and each other's. None if one can have no such amplitude, or the
-        amplitudes diverge round by round. Those of a square, which would go back and forth, go halfway.
+        amplitudes diverge round by round. Those of a square, which would go back and forth, go halfway. A share of
+        their size counts as settled in the end alone: it is many errors of a strong effect.
         """
         columns, settings = columns_of(candidates, members), self.data.context.settings
         null = self.data.context.null.with_extra_covariance(*scatters_of(candidates, members))
@@ -103,12 +104,13 @@ class PartialSearch:
                 t = t.copy()
                 t[:, columns] += beyond(null, t[:, columns], coordinates_of(candidates, members, effects), response)
                 before, fitted = fitted.amplitudes, null.fit(self.data.x, t[:, columns])
-                if has_settled(settings, before, fitted.amplitudes, fitted.covariance, settings.settled_share):
-                    return t
                 rounds.append((before, fitted.amplitudes))
+                if has_settled(settings, *rounds[-1], fitted.covariance):
+                    return t
                 share = steepness(rounds[-2], rounds[-1], fitted.covariance) if len(rounds) > 1 else 0.0
                 fitted = replace(fitted, amplitudes=before + (fitted.amplitudes - before) / (1.0 + share))
-        return None
+        settled = rounds and has_settled(settings, *rounds[-1], fitted.covariance, settings.settled_share)
+        return t if settled else None
 
 
 def has_settled(
