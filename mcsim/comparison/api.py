@@ -221,7 +221,8 @@ def _explained_in(
         return _result(pair, "identical"), None, 0.0
     problem = Problem(pair, others, accuracy * sky, library(sides.frame))
     sets = problem.best()
-    if sides.run is not None and not (sets and problem.complete(sets[0])):
+    # Next to nothing is left in K, whatever else differs.
+    if sides.run is not None and not (sets and problem.complete(sets[0]) and sets[0].size == 1.0):
         problem = replace(problem, library=(*problem.library, *effects_of(pair, sides.run)))
         sets = problem.best(1)
         there = problem.scene(sets[0].members) if sets and not second else None
@@ -271,9 +272,9 @@ def _result(
     problem: Problem | None = None,
     sets: Sequence[Set] = (),
 ) -> ChannelResult:
-    seen, explained = pair.seen, np.zeros_like(pair.a)
+    seen, explained, size = pair.seen, np.zeros_like(pair.a), 1.0
     if chosen and problem is not None:
-        explained = problem.of(chosen[0]).maps - pair.a
+        explained, size = problem.of(chosen[0]).maps - pair.a, chosen[0].size
     described = [_described(one, problem) for one in chosen if problem is not None]
     same = [other for one, own in zip(chosen, described, strict=False) for other in _equivalent(one, own, pair.turned)]
     nearest = _described(sets[0], problem) if sets and problem is not None else ()
@@ -290,7 +291,7 @@ def _result(
         sky_rms_uk=_sky_rms(pair),
         noncircular_rms_uk=np.nan if scene is None else _rms(scene.noncircular()[seen]),
         noise_rms_uk=np.nan if noise is None else _rms(noise[seen]),
-        left_rms_uk=_rms((pair.b - pair.a - explained)[seen]),
+        left_rms_uk=_rms((pair.b - pair.a - explained)[seen]) / size,
         looks=_looks(pair, explained) if verdict in ("unknown", "identical") else (),
         unmade_rms_uk=problem.unmade if verdict == "unknown" and problem is not None else 0.0,
         a=pair.b if pair.turned else pair.a,

@@ -111,6 +111,10 @@ class Difference:
         """Return what side B has more than side A, sample by sample; None: as the scene says."""
         return None
 
+    def size(self, value: Vector) -> float:
+        """Return the size of what it leaves over that in the larger unit of the two sides."""
+        return 1.0
+
     def amplitude(self, value: Vector) -> float:
         """Return the amplitude as it is reported."""
         return float(value[0]) if self.counted else 1.0

@@ -32,6 +32,8 @@ MORE_ALIKE = 0.2
 
 TOLD = 0.5  #: share of the pixels that are compared in which maps that may have been exchanged must have data
 
+LEAST, MOST = 0.1, 10.0  #: factors that a calibration is between; others are a unit's
+
 
 class Calibration(Difference):
     """The maps of side B are those of side A times a factor."""
@@ -45,10 +47,10 @@ class Calibration(Difference):
     def starts(self, state: State) -> list[Vector]:
         """Return the fraction, and 0 for maps with their noise or 1 for the sky alone, where they have noise.
 
-        Maps that share less than half of their variance are not each other's times a factor, and ten is a unit's.
+        Maps that share less than half of their variance are not each other's times a factor.
         """
         found, seen = [np.array([*state.fit([state.maps]), 0.0])], state.pair.seen
-        if not 0.1 < 1.0 + found[0][0] < 10.0 or 2.0 * np.sum(((1.0 + found[0][0]) * state.maps[seen]) ** 2) < np.sum(
+        if not LEAST < 1.0 + found[0][0] < MOST or 2.0 * np.sum(((1.0 + found[0][0]) * state.maps[seen]) ** 2) < np.sum(
             state.pair.b[seen] ** 2
         ):
             return []
@@ -61,6 +63,9 @@ class Calibration(Difference):
 
     def maps(self, maps: Maps, value: Vector, state: State) -> Maps:
         return maps if value[1] else (1.0 + value[0]) * maps
+
+    def within(self, value: Vector) -> Vector:
+        return np.array([np.clip(value[0], LEAST - 1.0, MOST - 1.0), value[1]])
 
     def inverse(self, value: Vector) -> Vector:
         return np.array([-value[0] / (1.0 + value[0]), value[1]])
@@ -99,13 +104,16 @@ class Unit(Difference):
     def inverse(self, value: Vector) -> Vector:
         return 1.0 / value
 
+    def size(self, value: Vector) -> float:
+        return min(1.0, abs(float(value[0])))
+
     def said(self, value: Vector) -> str:
         """Return words for a negative factor."""
         return "the other sign" if value[0] < 0.0 else ""
 
     def equivalent(self, value: Vector) -> list[tuple[str, float, str]]:
         """Return the calibration that does the same, if it could be one."""
-        return [("calibration", float(value[0]) - 1.0, "fraction")] if 0.1 < value[0] < 10.0 else []
+        return [("calibration", float(value[0]) - 1.0, "fraction")] if LEAST < value[0] < MOST else []
 
 
 class Monopole(Difference):

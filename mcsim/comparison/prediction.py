@@ -41,9 +41,14 @@ class Set:
     correction: Maps | None = None
 
     @property
+    def size(self) -> float:
+        """Size of what is left over that in the larger unit of the two sides: in K for uK next to nothing is left."""
+        return min((difference.size(value) for difference, value in self.members), default=1.0)
+
+    @property
     def explains(self) -> float:
-        """Share of the variance of the difference map."""
-        return 1.0 - self.left
+        """Share of the variance of the difference map, what is left being in the larger unit of the two sides."""
+        return 1.0 - self.left / self.size**2
 
     @property
     def names(self) -> frozenset[str]:

@@ -15,6 +15,7 @@ from mcsim.comparison.prediction import Prediction, Set
 from mcsim.comparison.scene_differences import Smoothing, TimeShift
 from mcsim.comparison.search import Problem, _in_turn
 from mcsim.comparison.time_differences import Interpolation
+from mcsim.ensemble.maps import write_map
 from mcsim.systematics.registry import catalogue
 
 
@@ -100,6 +101,29 @@ def test_a_pixel_gone_wrong_is_no_unit():
 def test_a_factor_beyond_ten_is_a_unit_and_no_calibration():
     assert Unit().equivalent(np.array([1e-6])) == []
     assert Unit().equivalent(np.array([0.8]))[0][1] == pytest.approx(-0.2)
+
+
+def test_no_calibration_makes_the_sky_vanish():
+    """Without an end one explains maps in K, which are next to nothing in uK."""
+    assert Calibration().within(np.array([-0.9999, 0.0])) == pytest.approx([-0.9, 0.0])
+    assert Calibration().within(np.array([0.2, 1.0])) == pytest.approx([0.2, 1.0])
+
+
+@pytest.mark.parametrize(("noise", "verdict"), [(0.1, "difference"), (0.6, "unknown")])
+def test_what_a_unit_leaves_is_in_the_larger_one(tmp_path, noise, verdict):
+    """In K next to nothing is left of uK, whatever else differs."""
+    draw = np.random.default_rng(4)
+    sky, white = 50.0 * draw.standard_normal((2, 12 * 8**2))
+    for side, values in (("a", sky), ("b", 1e-6 * (sky + noise * white))):
+        (tmp_path / side).mkdir()
+        write_map(tmp_path / side / "V.fits", values, "ecliptic")
+    found = mcsim.compare(tmp_path / "a", tmp_path / "b")
+    assert found.verdict == verdict
+    if verdict == "difference":
+        assert found.channels[0].left_rms_uk == pytest.approx(50.0 * noise, rel=0.1)
+        assert found.channels[0].left == pytest.approx(noise**2, rel=0.2)
+    else:
+        assert found.channels[0].nearest_explains == pytest.approx(1.0 - noise**2, abs=0.1)
 
 
 def test_what_a_grid_makes_is_the_same_whatever_side_b_has_observed(monkeypatch):
