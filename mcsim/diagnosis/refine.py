@@ -295,7 +295,7 @@ class Refiner:
         at, changes, pair = answer
         now.done[index] = at
         there = candidate.table(candidate.with_coordinates(at, np.eye(len(at))))
-        if nonlinear or self.data.changes_sky([there]):
+        if stochastic or nonlinear or self.data.changes_sky([there]):
             now.t[:, columns] += beyond(self.context.null, now.t[:, columns], at, changes.mean(axis=0))
         if stochastic:
             now.candidates[index] = replace(candidate, scatter=self.data.scatter(changes), shape_error=None)
