@@ -73,28 +73,22 @@ def test_what_a_pair_is_at_once_is_not_undone_round_by_round(monkeypatch):
     assert found.explanations[0].members == (0, 1)
 
 
-def test_amplitudes_of_squares_settle_at_once():
-    """By its secant, the square of 12 is that of 18 where it is simulated at 8, and that of 8 at 18."""
+@pytest.mark.parametrize(
+    ("truth", "straight", "first"),
+    [
+        pytest.param((12.0, 14.0), 8.0, 8.0, id="that swing: 12 is 18 by the secant of 8, and 8 by that of 18"),
+        pytest.param((100.0, 90.0), 97.7, 102.36, id="that move by less than 5 %, which is 2.7 errors"),
+    ],
+)
+def test_amplitudes_of_squares_settle_at_once(truth, straight, first):
+    """The response to A is its square over ``straight``, and its template at first the secant of ``first``."""
     instrument = Instrument(bend=0.0, cross=0.0)
-    straight = instrument.response
-    instrument.response = lambda a, b: straight(a * abs(a) / 8.0, b)
-    x = instrument.response(12.0, 14.0)
-    data = SimpleNamespace(context=instrument.context, x=x, respond=instrument.respond)
-    exact = PartialSearch(data).together(instrument.candidates, instrument.t, (0, 1))
-    assert instrument.null.fit(x, exact[:, :2]).amplitudes == pytest.approx([12.0, 14.0], abs=0.2)
-
-
-def test_strong_amplitudes_settle_at_once_by_their_errors():
-    """A square of 102.3 in place of 100, where simulated at 97.7, moved by less than 5 % and is wrong by 2.7 errors."""
-    instrument = Instrument(bend=0.0, cross=0.0)
-    straight = instrument.response
-    instrument.response = lambda a, b: straight(a * abs(a) / 97.7, b)
-    x = instrument.response(100.0, 90.0)
-    data = SimpleNamespace(context=instrument.context, x=x, respond=instrument.respond)
-    t = instrument.t.copy()
-    t[:, 0] *= 100.0**2 / 97.7**2
+    linear = instrument.response
+    instrument.response = lambda a, b: linear(a * abs(a) / straight, b)
+    data = SimpleNamespace(context=instrument.context, x=instrument.response(*truth), respond=instrument.respond)
+    t = instrument.t * [first / straight, 1.0, 1.0]
     exact = PartialSearch(data).together(instrument.candidates, t, (0, 1))
-    assert instrument.null.fit(x, exact[:, :2]).amplitudes == pytest.approx([100.0, 90.0], abs=0.2)
+    assert instrument.null.fit(data.x, exact[:, :2]).amplitudes == pytest.approx(truth, abs=0.2)
 
 
 def test_the_template_of_a_prior_is_not_that_of_all_at_once():
