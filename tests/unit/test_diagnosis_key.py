@@ -128,7 +128,7 @@ def another(value):
         case bool():
             return not value
         case tuple():
-            return (1.0,)
+            return (1.0,) if value else ("another",)
         case float():
             return value / 2
         case _:
