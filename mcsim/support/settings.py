@@ -39,7 +39,8 @@ def check_settings(settings: Any, shares: Iterable[str] = (), least: Mapping[str
             default = 1
         if isinstance(default, tuple) and (isinstance(value, str) or not isinstance(value, tuple | list)):
             raise InputError(f"{field.name} = {value!r} is no tuple; give one, such as ({value!r},).")
-        if get_args(field.type)[:1] == (str,) and (odd := [one for one in value if not isinstance(one, str)]):
+        named = get_args(field.type)[:1] == (str,) and isinstance(value, Iterable)
+        if named and (odd := [one for one in value if not isinstance(one, str)]):
             raise InputError(f"{field.name} = {value!r} has {odd[0]!r}, which is no name; give names, in quotes.")
         if isinstance(default, tuple) and default and not isinstance(default[0], str):
             _check_items(field.name, value, default[0], least.get(field.name, 0))

@@ -48,6 +48,8 @@ from refusals import refused
         (DiagnosisSettings, "prior_snr", ("a",)),
         (DiagnosisSettings, "beam_orders", 0),
         (LimitSettings, "only", "gain_drift"),
+        (LimitSettings, "nuisances", 3),
+        (LimitSettings, "nuisances", {3: 0.01}),
         (LimitSettings, "alpha", 2),
         (LimitSettings, "power", 90),
         (LimitSettings, "separation", 1.0),
