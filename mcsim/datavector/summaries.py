@@ -106,7 +106,6 @@ UNITS = {
     "monopole": "uK^-1",
     "dipole": "uK^-1",
     "plane": "uK^-1",
-    "square": "uK",
     "common": "uK^-2",
     "difference": "uK^-2",
     "contrast": "uK^2",
@@ -295,11 +294,20 @@ def _noise_block(model: Model, channel: int) -> Block:
 
 
 def _linearity_block(model: Model, channel: int) -> Block:
-    """Correlate the residual with the square of the sky: a gain that depends on the signal."""
+    """Correlate the residual with the square of the sky: a gain that depends on the signal.
+
+    In units of what noise makes of it on the sky that is observed: squares of few bright modes differ from sky to sky,
+    and the product as it stands has a few values that are far off.
+    """
     parts, name = model.of(channel), model.channels[channel]
 
     def value(filtered: FilteredMaps) -> float:
-        return float(sum(np.dot(filtered.residual[i], filtered.expected[i] ** 2) for i in parts))
+        product = variance = 0.0
+        for i in parts:
+            square = filtered.expected[i] ** 2
+            product += np.dot(filtered.residual[i], square)
+            variance += np.dot(model.parts[i].precision, square**2)
+        return float(divided(product, np.sqrt(variance)))
 
     return Block((Element(f"square/{name}", "map", (name,), kind="square"),), value)
 

@@ -119,6 +119,17 @@ def test_elements_scale_as_their_units_say(analysis) -> None:
         np.testing.assert_allclose(other, expected * one, rtol=1e-6, atol=1e-9)
 
 
+def test_the_product_of_residual_and_squared_sky_scatters_alike_on_every_sky(analysis) -> None:
+    """As it stood a sky four times as bright made it sixteen times as large, and few bright modes a tail."""
+    block = next(one for one in blocks_of(analysis.model) if one.elements[0].kind == "square")
+    filtered = wiener_filter(analysis.model, list(simulate.maps(survey(analysis.run), 0)))
+    brighter = replace(filtered, expected=4.0 * filtered.expected)
+    assert block.values(brighter) == pytest.approx(block.values(filtered))
+    draw, precision = np.random.default_rng(0), np.stack([part.precision for part in analysis.model.parts])
+    noise = (replace(filtered, residual=np.sqrt(precision) * draw.standard_normal(precision.shape)) for _ in range(300))
+    assert np.std([block.values(one) for one in noise]) == pytest.approx(1.0, abs=4.0 / np.sqrt(600.0))
+
+
 def test_ranges_end_at_the_edges_and_the_widest_are_halved() -> None:
     found = ranges_within(EDGES, 8)
     assert len(found) == 8
