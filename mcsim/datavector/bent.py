@@ -17,9 +17,10 @@ def bent_templates(
     """Return templates ``t``, shape (p, K), of which some are secants of parabolas, exact where these fit data best.
 
     ``curvature``, shape (p, K), has half the second derivatives in each coordinate. Secants are those of candidates
-    whose straight response fits at coordinates where the bent part is larger than itself. Elements that are squares of
-    maps then hold most of what a strong effect does, and a straight fit to these says nothing of its amplitude.
-    Parabolas hold for what changes maps in proportion to the coordinates, as additions and gains do and beams do not.
+    whose bent part is larger than the straight one: where the straight response fits, or where the parabola does if it
+    leaves less than half of chi^2 there. Elements that are squares of maps then hold most of what a strong effect does,
+    and a straight fit to these says nothing of its amplitude. Parabolas hold for what changes maps in proportion to the
+    coordinates, as additions and gains do and beams do not.
     """
     bent, y = t.copy(), null.whiten(x)
     for candidate in candidates:
@@ -30,15 +31,29 @@ def bent_templates(
         columns = list(candidate.columns)
         straight, square = (null.whiten_templates(one[:, columns]) for one in (t, curvature))
         first = np.asarray(np.linalg.lstsq(straight, y, rcond=None)[0], dtype=np.float64)
-        if np.linalg.norm(square @ first**2) <= np.linalg.norm(straight @ first):
-            continue
         best = _fit(y, straight, square, first)
+        if best is None or not (_more_bent(straight, square, first) or _halved(y, straight, square, first, best)):
+            continue
         covariance = np.asarray(np.linalg.pinv(straight.T @ straight), dtype=np.float64)
-        if best is None or not np.isfinite(candidate.beyond(best, covariance)):
+        if not np.isfinite(candidate.beyond(best, covariance)):
             continue
         response = t[:, columns] @ best + curvature[:, columns] @ best**2
         bent[:, columns] += beyond(null, t[:, columns], best, response)
     return bent
+
+
+def _more_bent(straight: Matrix, square: Matrix, at: Vector) -> bool:
+    """Return True if the bent part of a response is larger than the straight one at coordinates."""
+    return bool(np.linalg.norm(square @ at**2) > np.linalg.norm(straight @ at))
+
+
+def _halved(y: Vector, straight: Matrix, square: Matrix, first: Vector, best: Vector) -> bool:
+    """Return True if a parabola that is more bent than straight leaves less than half of what the straight fit does.
+
+    The straight fit may lie far below: of data that are mostly squares it says nothing.
+    """
+    left = np.linalg.norm(y - straight @ best - square @ best**2)
+    return _more_bent(straight, square, best) and bool(2.0 * left**2 < np.linalg.norm(y - straight @ first) ** 2)
 
 
 def beyond(null: SimulatedGaussian, t: Matrix, at: Vector, response: Vector) -> Matrix:

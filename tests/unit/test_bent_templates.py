@@ -67,6 +67,17 @@ def test_the_secant_is_that_of_the_true_amplitude(at):
     np.testing.assert_array_equal(found[:, 2], T[:, 2])
 
 
+def test_a_straight_fit_that_lies_far_below_is_no_reason_to_stay_straight():
+    """A calibration of 3 % was fitted as one of 0.08 %, where nothing is bent, and a ring was named for it."""
+    at, bend = np.array([6.0, -8.0]), 2.0
+    x = bend * SQUARE * (at @ at) + RNG.normal(size=P)
+    x += T[:, :2] @ (0.04 * at - NULL.fit(x, T[:, :2]).amplitudes)
+    curvature = np.outer(bend * SQUARE, [1.0, 1.0, 0.0])
+    found = bent_templates(NULL, x, T, curvature, (Candidate(Vector, "A", (0, 1)), Candidate(Vector, "B", (2,))))
+    assert np.linalg.norm(NULL.fit(x, found[:, :2]).amplitudes) == pytest.approx(np.linalg.norm(at), rel=0.05)
+    np.testing.assert_array_equal(found[:, 2], T[:, 2])
+
+
 @pytest.mark.parametrize(
     ("at", "bend", "kind"),
     [
