@@ -66,9 +66,11 @@ def scored(jobs: Iterable[Job]) -> list[Matrix]:
     return [simulated_scores.scores(job) for job in jobs]
 
 
-def learned(table: dict[str, Any], *more: str, simulations: int = 260) -> DiagnosisContext:
-    """Return what is learned of a run, with PROPOSED effects and ``more`` alone."""
-    without = [name for name in systematics.catalogue() if name not in (*PROPOSED, *more)]
+def learned(
+    table: dict[str, Any], *more: str, simulations: int = 260, proposed: tuple[str, ...] = PROPOSED
+) -> DiagnosisContext:
+    """Return what is learned of a run, with ``proposed`` effects and ``more`` alone."""
+    without = [name for name in systematics.catalogue() if name not in (*proposed, *more)]
     analysis = analysis_of(config.load(table), without=without, settings=DiagnosisSettings(beam_orders=2))
     return context(analysis, *campaign.learned(analysis, ask, simulations, time_ordered=False))
 
