@@ -9,43 +9,45 @@ P, SIMULATIONS, DRAWS, TRIALS = 40, 400, 16, 80
 
 
 def test_pulls_beside_drawn_patterns_have_unit_width() -> None:
-    """The pattern moves the amplitudes, and its covariance is that of 16 draws."""
-    rng = np.random.default_rng(20140317)
+    """The pattern moves the amplitudes, and 12 draws tell its 8 modes: the errors of the fit are half of that."""
+    rng, count = np.random.default_rng(20140317), 12
     t, truth = rng.normal(size=(P, 2)), np.array([10.0, 4.0])
-    modes = rng.normal(size=(P, 8)) * np.array([3.0, 2.0, 2.0, 1.0, 1.0, 1.0, 0.5, 0.5])
-    modes[:, 0] = t @ [3.0, 0.5]
-    pulls = []
+    modes = rng.normal(size=(P, 8)) * np.array([30.0, 20.0, 20.0, 10.0, 10.0, 10.0, 5.0, 5.0])
+    modes[:, 0] = t @ [20.0, 10.0]
+    pulls, plain = [], []
     for _ in range(TRIALS):
         null = SimulatedGaussian.from_simulations(rng.normal(size=(SIMULATIONS, P)))
-        draws = modes @ rng.normal(size=(8, DRAWS))
-        scatter = (draws - draws.mean(axis=1, keepdims=True)) * np.sqrt((1.0 + 1.0 / DRAWS) / (DRAWS - 1.0))
+        draws = modes @ rng.normal(size=(8, count))
+        scatter = (draws - draws.mean(axis=1, keepdims=True)) * np.sqrt((1.0 + 1.0 / count) / (count - 1.0))
         x = t @ truth + modes @ rng.normal(size=8) + rng.normal(size=P)
         found = null.with_extra_covariance(scatter).fit(x, t)
         wide = with_drawn_scatter(null, t, found, [scatter])
         np.testing.assert_array_equal(wide.amplitudes, found.amplitudes)
         pulls.append((found.amplitudes - truth) / wide.errors)
-    # A width has an error of 1/sqrt(2 TRIALS), and that of 16 draws of about a sixth averages out: 3.5 sigma.
-    widths = np.sqrt(np.mean(np.square(pulls), axis=0))
+        plain.append((found.amplitudes - truth) / found.errors)
+    # A width has an error of 1/sqrt(2 TRIALS), and that of 12 draws of about a fifth averages out: 3.5 sigma.
+    widths, narrow = (np.sqrt(np.mean(np.square(one), axis=0)) for one in (pulls, plain))
     np.testing.assert_allclose(widths, 1.0, atol=3.5 / np.sqrt(2.0 * TRIALS))
+    assert np.all(narrow > 1.6)
 
 
 def test_pulls_have_unit_width_where_noise_is_in_what_is_drawn() -> None:
     """A strong response multiplies noise, so that what it adds is correlated with the data without it."""
-    rng, draws = np.random.default_rng(20140318), 24
-    t, truth = rng.normal(size=(P, 2)), np.array([10.0, 4.0])
-    gains = 2.0 * t @ np.linalg.pinv(t)  # along the templates noise is three times what it is without the response
+    rng, draws, p, trials = np.random.default_rng(20140318), 12, 12, 160
+    t, truth = rng.normal(size=(p, 2)), np.array([10.0, 4.0])
+    gains = t @ np.linalg.pinv(t)  # along the templates noise is twice what it is without the response
     pulls = []
-    for _ in range(TRIALS):
-        null = SimulatedGaussian.from_simulations(rng.normal(size=(SIMULATIONS, P)))
-        noise, own = rng.normal(size=(P, draws)), rng.normal(size=P)
+    for _ in range(trials):
+        null = SimulatedGaussian.from_simulations(rng.normal(size=(SIMULATIONS, p)))
+        noise, own = rng.normal(size=(p, draws)), rng.normal(size=p)
         without = (noise - noise.mean(axis=1, keepdims=True)) * np.sqrt((1.0 + 1.0 / draws) / (draws - 1.0))
         scatter, x = gains @ without, t @ truth + own + gains @ own
         found = null.with_extra_covariance(scatter).fit(x, t)
         errors = with_drawn_scatter(null, t, found, [scatter], [without]).errors
         pulls.append((found.amplitudes - truth) / errors)
-    # Without that correlation it would be sqrt(9/5).
+    # Without that correlation it would be sqrt(2), which is most for equal noise and response.
     widths = np.sqrt(np.mean(np.square(pulls), axis=0))
-    np.testing.assert_allclose(widths, 1.0, atol=3.5 / np.sqrt(2.0 * TRIALS))
+    np.testing.assert_allclose(widths, 1.0, atol=3.5 / np.sqrt(2.0 * trials))
 
 
 def test_what_is_found_beside_a_drawn_pattern_is_as_rare_as_it_says() -> None:
