@@ -199,19 +199,19 @@ def test_posterior_is_calibrated():
 
 @pytest.fixture(scope="module", params=[0.0, 12.0])
 def frozen_fits(request) -> dict[str, np.ndarray]:
-    """Amplitudes fitted to 40 data and frozen for 30 others, where templates and gap are the effect's; 600 times."""
+    """Twelve amplitudes fitted to 40 data and frozen for 30 others, whose gap is that of two of them; 600 times."""
     rng = np.random.default_rng(SEED)
-    count, p = 500, 30
-    t_fit, t_test = rng.normal(size=(40, 2)), rng.normal(size=(p, 2))
+    count, p, columns = 500, 30, 12
+    t_fit, t_test = rng.normal(size=(40, columns)), rng.normal(size=(p, columns))
     t_fit /= np.linalg.norm(t_fit, axis=0)
     t_test /= np.linalg.norm(t_test, axis=0)
-    truth = np.array([request.param, 0.5 * request.param])
+    truth = request.param * np.where(np.arange(columns) == 0, 1.0, 0.5 * (np.arange(columns) == 1))
     found: dict[str, list] = {
         name: [] for name in ("drop", "sigma", "forecast", "forecast_sigma", "fraction", "pull", "before", "after")
     }
     signal = t_test @ truth
     # What no candidate explains keeps the gap of the case without an effect well away from zero.
-    other = np.linalg.qr(np.column_stack([t_test, rng.normal(size=p)]))[0][:, 2] * 12.0
+    other = np.linalg.qr(np.column_stack([t_test, rng.normal(size=p)]))[0][:, columns] * 12.0
     for _ in range(600):
         best = drawn_null(rng, 40, count).fit(t_fit @ truth + rng.normal(size=40), t_fit)
         before, after = drawn_null(rng, p, count), drawn_null(rng, p, count)
