@@ -28,7 +28,7 @@ def table(tmp_path_factory):
 
 
 def test_behind_a_mask_no_sky_looks_like_its_own_modulation(table):
-    """With products of two maps as they respond in each sky the mean of -log p is 4.8 for a quadrupole."""
+    """With products of two maps as they respond in each sky the mean of -log p is 6.7 for a quadrupole."""
     known = learned(table, "dipole_modulation", "quadrupole_modulation", proposed=())
     model = known.analysis.model
     always = replace(known.analysis, model=replace(model, settings=replace(model.settings, alpha=1.0)))
