@@ -167,20 +167,23 @@ def test_confusion_is_that_of_drawn_scores(cosine):
 
 
 def test_posterior_is_calibrated():
-    """Of effects drawn from the prior, the probability given to the favourite is the fraction that is right."""
+    """Of effects drawn from the prior, the probability given to the favourite is the fraction that is right.
+
+    By 100 simulations of 20 elements: with a Gaussian likelihood those above 0.9 are right too seldom, by 15 sigma.
+    """
     rng = np.random.default_rng(SEED)
-    p, count, draws = 20, 400, 3000
+    p, count, draws = 20, 100, 2000
     t = rng.normal(size=(p, 9))
     t[:, 4] = t[:, 0] + 0.5 * rng.normal(size=p)
     groups = [(0,), (1, 2), (3,), (4,), (5, 6, 7), (8,)]
     strengths, prior = np.linspace(1.0, 7.0, 25), np.array([0.4, *[0.1] * 6])
     exact = SimulatedGaussian(np.zeros(p), np.eye(p), 10**9).whiten_groups(t, groups)
     fiducial, right = [], []
-    for _ in range(draws // 20):
+    for _ in range(draws // 5):
         found = drawn_null(rng, p, count)
         candidates = found.whiten_groups(t, groups)
-        truth = rng.choice(7, size=20, p=prior)
-        x = rng.normal(size=(20, p))
+        truth = rng.choice(7, size=5, p=prior)
+        x = rng.normal(size=(5, p))
         for row, index in zip(x, truth, strict=True):
             if index:
                 basis = exact.basis[:, exact.start[index - 1] : exact.start[index]]
