@@ -58,6 +58,21 @@ def test_the_error_is_the_scatter_over_sets_of_probes(filtering: Filtering) -> N
         assert abs(ratio - 1.0) < 3.0 * np.sqrt(2.0 / (SETS - 1))
 
 
+def test_the_variance_is_that_of_inverses_of_gaussian_draws() -> None:
+    """Of 20,000 sets of 20 draws: numbers that are zero have the first term alone, of the largest it is half."""
+    rng, draws, sets = np.random.default_rng(20170301), 20, 20_000
+    matrix = np.diag([2.0, 1.0, 1.0, 3.0]) + 0.3 * (np.eye(4, k=1) + np.eye(4, k=-1))
+    numbers, size = np.array([3.0, 0.0, 0.0, -1.0]), len(matrix)
+    rows = rng.normal(size=(sets, draws, size)) @ np.linalg.cholesky(matrix).T
+    found = np.linalg.solve(np.swapaxes(rows, 1, 2) @ rows, (matrix @ numbers)[:, None])[..., 0] * (draws - size - 1.0)
+    total = float(numbers @ matrix @ numbers)
+    expected = inverse_variance(np.diag(np.linalg.inv(matrix)), numbers**2, total, size, draws)
+    variances, fourth = np.var(found, axis=0), np.mean((found - found.mean(axis=0)) ** 4, axis=0)
+    sigma = np.sqrt((fourth / variances**2 - 1.0) / sets)
+    np.testing.assert_array_less(abs(variances / expected - 1.0), 4.0 * sigma)
+    np.testing.assert_array_less(sigma, 0.03)
+
+
 def test_too_few_draws_tell_nothing() -> None:
     one = np.ones(1)
     assert np.isinf(inverse_variance(one, one, 1.0, 12, 15.0)).all()
