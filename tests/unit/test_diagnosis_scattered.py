@@ -216,3 +216,17 @@ def test_noise_that_a_response_multiplies_counts_with_what_it_adds_to() -> None:
     scatter = 2.0 * t @ t.T @ noise
     found = null.with_extra_covariance(scatter).fit(10.0 * t[:, 0], t)
     assert with_drawn_scatter(null, t, found, [scatter], [noise]).errors[0] == pytest.approx(3.0, rel=1e-6)
+
+
+def test_a_growth_is_unbiased() -> None:
+    """Changes of twice the scatter, of either sign, along every direction of the skies but their mean."""
+    skies, size = 8, 2.0
+    nu = skies - 1
+    directions = np.linalg.svd(np.eye(skies) - 1.0 / skies)[0][:, :nu]
+    own = np.sqrt(nu) * directions @ np.full(nu, nu**-0.5)  # of variance one
+    changes = size * np.sqrt(nu) * np.column_stack([np.zeros(skies), directions, -directions])
+    before = np.repeat(own[:, None], changes.shape[1], axis=1)
+    model, groups = SimulatedGaussian(np.zeros(2 * nu + 1), np.eye(2 * nu + 1), 10**9), list(range(2 * nu + 1))
+    found = Acting.of(model, np.eye(2 * nu + 1), [(k,) for k in groups], 0, (before, before + changes))
+    # Once in the data and once in the mean of the skies.
+    assert np.mean(found.excess[1:]) == pytest.approx(size**2 * (1.0 + 1.0 / skies), rel=1e-6)
