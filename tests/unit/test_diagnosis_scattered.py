@@ -218,6 +218,15 @@ def test_noise_that_a_response_multiplies_counts_with_what_it_adds_to() -> None:
     assert with_drawn_scatter(null, t, found, [scatter], [noise]).errors[0] == pytest.approx(3.0, rel=1e-6)
 
 
+def test_what_does_not_scatter_leaves_the_errors_of_the_fit() -> None:
+    """With 30 simulations: errors of a Student t, whose squares are 2.5 times those of the weights."""
+    rng = np.random.default_rng(8)
+    null, t = SimulatedGaussian.from_simulations(rng.normal(size=(30, P))), rng.normal(size=(P, 2))
+    found = null.fit(rng.normal(size=P), t)
+    wide = with_drawn_scatter(null, t, found, [np.zeros((P, 6))])
+    np.testing.assert_allclose(wide.covariance, found.covariance, rtol=1e-9)
+
+
 def test_a_growth_is_unbiased() -> None:
     """Changes of twice the scatter, of either sign, along every direction of the skies but their mean."""
     skies, size = 8, 2.0
