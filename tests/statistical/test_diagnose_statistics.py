@@ -204,7 +204,7 @@ def test_posterior_is_calibrated():
 def frozen_fits(request) -> dict[str, np.ndarray]:
     """Twelve amplitudes fitted to 40 data and frozen for 30 others, whose gap is that of two of them; 600 times.
 
-    Where the effects are all that is there, the noise that both gaps have is most of the error: pulls are 2.5 wide without it.
+    Where effects are all that is there the noise that both gaps have is most of the error: pulls are 2.5 wide without.
     """
     strength, unexplained = request.param
     rng = np.random.default_rng(SEED)
@@ -244,40 +244,52 @@ def test_forecast_drop_is_the_drop(frozen_fits):
     assert abs(difference.mean()) < 4.0 * difference.std() / np.sqrt(len(difference))
 
 
-@pytest.mark.parametrize("brightness", [0.0, 0.6])
-def test_forecast_drop_of_what_draws_is_the_drop(brightness):
-    """A response that scatters by 0.3 of itself: 40 data are fitted, and 30 others see the same draw.
+def falls_of_draws(brightness: float, columns: int, strength: float) -> np.ndarray:
+    """Fall of chi^2 by what was fitted, less the forecast, and the error of this, shape (trials, 2 signs of noise, 2).
 
-    The whole of it may be brighter or fainter, lognormally distributed.
+    A response that scatters by 0.3 of itself: 40 data are fitted by it and other templates, and 30 others see the same
+    draw. The whole of it may be brighter or fainter, lognormally distributed.
     """
     rng = np.random.default_rng(SEED)
     fitted, p, count, draws = 40, 30, 500, 48
-    t = rng.normal(size=fitted + p)
-    t *= 15.0 / np.linalg.norm(t)
-    sideways = rng.normal(size=(fitted + p, 2))
-    root = 0.3 * np.column_stack([t, 15.0 * sideways / np.linalg.norm(sideways, axis=0)])
-    differences, errors = [], []
+    templates = rng.normal(size=(fitted + p, columns))
+    templates *= strength / np.linalg.norm(templates, axis=0)
+    t, sideways = templates[:, 0], rng.normal(size=(fitted + p, 2))
+    root = 0.3 * np.column_stack([t, strength * sideways / np.linalg.norm(sideways, axis=0)])
+    found = []
     for _ in range(140):
         learning, before = drawn_null(rng, fitted, count), drawn_null(rng, p, count)
         bright = np.exp(brightness * rng.normal(size=draws + 1) - brightness**2 / 2.0)
         scatter = bright[1:] * (t[:, None] + root @ rng.normal(size=(3, draws)))
         scatter = (scatter - scatter.mean(axis=1, keepdims=True)) / np.sqrt(draws - 1.0)
-        x = bright[0] * (t + root @ rng.normal(size=3)) + rng.normal(size=fitted + p)
-        frozen = learning.with_extra_covariance(scatter[:fitted]).fit(x[:fitted], t[:fitted, None])
-        noise = learning.fit(x[:fitted], t[:fitted, None]).covariance
-        after = replace(before, mean=before.mean + t[fitted:] * frozen.amplitudes[0]).with_extra_covariance(
-            scatter[fitted:]
-        )
         drawn = (t + np.sqrt(draws) * scatter.T) ** 2
-        seen = excess(learning, x[:fitted])
         shares = drawn[:, fitted:].sum(axis=1) / drawn[:, :fitted].sum(axis=1)
-        forecast = expected_fall_of_draw(after, t[fitted:, None], noise, seen, shares)
-        shrink = held_out(before, after, x[fitted:], forecast, "others")
-        differences.append(shrink.before.value - shrink.after.value - forecast.value)
-        errors.append(forecast.sigma)
+        signal, noise = bright[0] * (t + root @ rng.normal(size=3)), rng.normal(size=fitted + p)
+        learned = learning.with_extra_covariance(scatter[:fitted])
+        for x in (signal + noise, signal - noise):
+            frozen = learned.fit(x[:fitted], templates[:fitted]).amplitudes
+            errors = learning.fit(x[:fitted], templates[:fitted]).covariance
+            moved = replace(before, mean=before.mean + templates[fitted:] @ frozen)
+            after = moved.with_extra_covariance(scatter[fitted:])
+            seen = excess(learning, x[:fitted])
+            forecast = expected_fall_of_draw(after, templates[fitted:], errors, seen, shares)
+            shrink = held_out(before, after, x[fitted:], forecast, "others")
+            found.append([shrink.before.value - shrink.after.value - forecast.value, forecast.sigma])
+    return np.reshape(found, (-1, 2, 2))
+
+
+@pytest.mark.parametrize("brightness", [0.0, 0.6])
+def test_forecast_drop_of_what_draws_is_the_drop(brightness):
+    differences, errors = falls_of_draws(brightness, 1, 15.0)[:, 0].T
     assert abs(np.mean(differences)) < 4.0 * np.std(differences) / np.sqrt(len(differences))
     # Forecasts of the mean drop: the noise of the data that measure it is not in their error.
     assert 0.7 < 1.0 / np.std(np.divide(differences, errors)) < 1.2
+
+
+def test_errors_of_what_was_fitted_are_forecast_to_cost_what_they_do():
+    """Those of sixteen amplitudes 20, 12 times the error of the mean over both signs of the noise."""
+    differences = falls_of_draws(0.0, 16, 8.0)[..., 0].mean(axis=1)
+    assert abs(np.mean(differences)) < 4.0 * np.std(differences) / np.sqrt(len(differences))
 
 
 def test_gap_is_the_squared_distance(frozen_fits):
