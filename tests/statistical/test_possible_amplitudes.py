@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mcsim.datavector.candidate import Candidate
+from mcsim.datavector.candidate import Candidate, beyond, lost
 from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.diagnosis.partial import PartialSearch
-from mcsim.stats.gaussian import SimulatedGaussian, nested_pvalue
+from mcsim.stats.gaussian import Fit, SimulatedGaussian, nested_pvalue
 from mcsim.stats.look_elsewhere import Calibration
+from mcsim.stats.scattered import Acting
 from mcsim.systematics import Bound, Effect, Parametrization
 
 P = 6
@@ -89,3 +90,29 @@ def test_an_impossible_amplitude_explains_what_its_possible_part_does(besides: f
     assert free.pvalue(z, besides) < 0.5 * known.pvalue(z, besides)
     # More than three errors beyond is not this effect at all.
     assert known.pvalue(3.6 if besides == 0.0 else 7.6, besides) == 1.0
+
+
+def bounded_pair() -> list[Candidate]:
+    """Two candidates that can be up to one, in a fit whose errors are one."""
+    bounded = Known(-1.0, 1.0).candidates[1]
+    return [bounded, replace(bounded, columns=(1,))]
+
+
+def fitted(*amplitudes: float) -> Fit:
+    return Fit(np.array(amplitudes), np.eye(2), 12, 0.0, 1.0, 10.0, 10, 1.0)
+
+
+def test_what_makes_another_member_impossible_is_lost() -> None:
+    candidates = bounded_pair()
+    # Errors are those of a Student t: their squares are (n + chi^2)/(dof - 2) = 3 times those of the fit's metric.
+    assert lost(candidates, (0, 1), fitted(2.5, 3.0), 20) == pytest.approx(3.0 * 2.0**2)
+    assert lost(candidates, (0, 1), fitted(5.0, 0.5), 20) == np.inf
+
+
+def test_a_fit_is_beyond_bounds_by_errors_with_what_the_effect_scatters() -> None:
+    candidates = bounded_pair()
+    assert beyond(candidates, (0, 1), fitted(2.5, 3.0)) == pytest.approx(2.5)
+    none = np.zeros(2)
+    for own, expected in ((3.0, 2.5 / 2.0), (-0.75, 2.5)):  # less scatter makes no error less
+        acting = [replace(one, acting=Acting(1.0, 0.0, 0.0, none, none, own)) for one in candidates]
+        assert beyond(acting, (0, 1), fitted(2.5, 3.0)) == pytest.approx(expected)
