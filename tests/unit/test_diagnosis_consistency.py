@@ -366,6 +366,15 @@ def test_a_ring_has_one_sign(quadrupole, error, possible):
         assert distance == 0.0
 
 
+def test_the_ring_of_one_sign_that_is_nearest_has_an_amplitude_of_its_own():
+    """Of (-2, 5) the sum is 3: a ring of q = 1 and this sum is (0, 3), but the nearest one is (0, 5)."""
+    ring = Candidate(systematics.get("beam_sidelobe"), "W1", (0, 1), {"calibrated": "none"})
+    coordinates, covariance = 1e-5 * np.array([-2.0, 5.0]), 4e-10 * np.eye(2)
+    fitted = ring.fitted(coordinates, covariance)
+    assert (fitted.amplitude, fitted.quadrupole) == (pytest.approx(5e-5, rel=1e-9), 1.0)
+    assert ring.beyond(coordinates, covariance) == pytest.approx(1.0, rel=1e-9)
+
+
 @pytest.mark.parametrize(
     ("along", "across", "possible"),
     [(0.0, 0.0027, False), (0.05, 0.0, True), (-0.003, 0.0018, True), (0.003, -9e-4, True)],
