@@ -79,8 +79,8 @@ def _growth(x: Matrix, c: Matrix) -> tuple[float, float]:
     nu = max((skies - 1.0) * columns, 1.0)
     b = float(np.sum(x * c) / max(np.sum(x**2), 1e-300))
     r = float(np.sum((c - b * x) ** 2)) / max(nu - 1.0, 1.0)
-    square = b**2 - r / nu
-    growth = 2.0 * b + square + r + (square + r) / skies
+    varied = b**2 - r / nu + r
+    growth = 2.0 * b + varied + varied / skies
     return growth, (4.0 * (1.0 + b) ** 2 * r + 2.0 * r**2) / nu
 
 
