@@ -13,7 +13,7 @@ from mcsim.systematics import Effect, Parametrization
 P = 40
 RNG = np.random.default_rng(17)
 NULL = SimulatedGaussian.from_simulations(RNG.normal(size=(800, P)))
-ALONG, BESIDE, OTHER, SQUARE, *_ = np.linalg.qr(RNG.normal(size=(P, 4)))[0].T
+ALONG, BESIDE, OTHER, SQUARE, REST = np.linalg.qr(RNG.normal(size=(P, 5)))[0].T
 T = np.stack([ALONG, BESIDE, OTHER], axis=1)
 
 
@@ -76,6 +76,22 @@ def test_a_straight_fit_that_lies_far_below_is_no_reason_to_stay_straight():
     found = bent_templates(NULL, x, T, curvature, (Candidate(Vector, "A", (0, 1)), Candidate(Vector, "B", (2,))))
     assert np.linalg.norm(NULL.fit(x, found[:, :2]).amplitudes) == pytest.approx(np.linalg.norm(at), rel=0.05)
     np.testing.assert_array_equal(found[:, 2], T[:, 2])
+
+
+@pytest.mark.parametrize(("left", "taken"), [(0.4, True), (0.6, False)])
+def test_a_parabola_that_leaves_more_than_half_is_chance(left, taken):
+    """What neither the straight response nor its square explains is ``left`` of what the straight fit leaves."""
+    at, bend = np.array([6.0, -8.0]), 2.0
+    square = bend * SQUARE * (at @ at)
+    x = square + np.sqrt(left / (1.0 - left) * (square @ square)) * REST
+    x += T[:, :2] @ (0.04 * at - NULL.fit(x, T[:, :2]).amplitudes)
+    found = bent_templates(NULL, x, T, np.outer(bend * SQUARE, [1.0, 1.0, 0.0]), (Candidate(Vector, "A", (0, 1)),))
+    assert np.array_equal(found, T) is not taken
+
+
+def test_a_parabola_that_fits_worse_than_the_straight_response_is_none():
+    at = np.array([6.0, -8.0])
+    np.testing.assert_array_equal(bent(T[:, :2] @ at + 20.0 * REST, 2.0), T)
 
 
 @pytest.mark.parametrize(
