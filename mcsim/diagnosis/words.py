@@ -25,11 +25,12 @@ SETS = 2  #: alternatives that a sentence has room for
 def sentence(result: DiagnosisResult) -> str:
     """Return the verdict in one sentence."""
     p = p_equals(result.test.pvalue)
+    chance = ", which may be chance" if result.test.pvalue > DISAGREES else ""
     if result.kind == "none":
         return f"The model describes the data ({p}){', but for one group of numbers' if _unnoticed(result) else ''}."
     start = f"The model does not describe the data ({p})"
     if result.faint:
-        return f"{start}, but the departure is too faint to name its cause."
+        return f"{start}{chance}, but the departure is too faint to name its cause."
     if result.orders:
         return f"{start}. {' '.join(result.orders)}"
     if result.kind == "unknown":
@@ -40,7 +41,6 @@ def sentence(result: DiagnosisResult) -> str:
         if len(result.partial) > 1 and result.partial_left is not None:
             left = f"{100 * result.partial_left:.0f} % of the excess χ²"
             missing += f" Detected are {_effects(result.partial)}; they leave {left}."
-        chance = ", which may be chance" if result.test.pvalue > DISAGREES else ""
         return f"{start}{chance}, and no effect of the library explains why.{missing}"
     if result.kind == "degenerate":
         shown = [_effects(one.effects) for one in result.sets[: SETS + 1]]
@@ -82,15 +82,15 @@ def status(result: DiagnosisResult) -> str:
         return f"Neither χ² nor any candidate departs from the simulations. {rest}"
     if result.orders:
         return " ".join(result.orders)
-    near = result.candidates[result.nearest]
+    near, p = result.candidates[result.nearest], result.test.pvalue
+    chance = f" Data of the model depart as far in {100 * p:.2g} % of cases." if p > DISAGREES else ""
     if result.faint:
         return (
             f"Nearest is {near.label}. But all sets of effects that describe the data have together a probability of "
             f"{100 * result.probability:.0f} %, against no effect, an unlisted one, and the rest of the library."
+            f"{chance}"
         )
     if result.kind == "unknown":
-        p = result.test.pvalue
-        chance = f" Data of the model depart as far in {100 * p:.2g} % of cases." if p > DISAGREES else ""
         left = "" if result.nearest_pvalue is None else f"; what it leaves {residual(result.nearest_pvalue)}"
         return (
             f"The most similar candidate is {near.label}: cosine {result.cosine:.2f} with the departure, so that it "

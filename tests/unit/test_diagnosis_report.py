@@ -232,12 +232,12 @@ def test_first_screen_says_what_was_tested_and_found(diagnoses, pages, kind):
     assert ("cosine" in header) == (kind == "unknown")
 
 
+@pytest.mark.parametrize("faint", [False, True])
 @pytest.mark.parametrize(("pvalue", "said"), [(0.03, True), (1e-4, False)])
-def test_a_marginal_departure_without_a_cause_may_be_chance(diagnoses, pvalue, said):
+def test_a_marginal_departure_without_a_cause_may_be_chance(diagnoses, pvalue, said, faint):
     known = diagnoses["unknown"]
-    result = replace(known, test=replace(known.test, pvalue=pvalue))
-    assert ("may be chance" in words.sentence(result)) == said
-    assert ("3 % of cases" in words.status(result)) == said
+    result = replace(known, test=replace(known.test, pvalue=pvalue), faint=faint, probability=0.1)
+    assert ["may be chance" in words.sentence(result), "3 % of cases" in words.status(result)] == [said, said]
 
 
 def test_an_unknown_gap_says_what_the_nearest_candidate_leaves(diagnoses, tmp_path):
