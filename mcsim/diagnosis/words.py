@@ -8,6 +8,7 @@ from mcsim.datavector.nuisances import NuisanceResult
 from mcsim.diagnosis.fitted import EffectResult, EffectSet
 from mcsim.diagnosis.result import Agreement, DiagnosisResult
 from mcsim.diagnosis.selection import Contrast
+from mcsim.reconstruction.structure import ALIKE, OPPOSITE
 from mcsim.stats.excess import HeldOut, Measured
 from mcsim.support.numbers import measured, number, p_equals
 
@@ -204,7 +205,10 @@ def unlisted(result: DiagnosisResult) -> list[str]:
     found = [one.sentence for one in result.unlisted]
     held = result.unlisted_held_out
     if result.unlisted[0].file is None:  # the others are what it leaves
-        return [*found, "No effect of the simulator can be like it, so that its reduction is not measured."]
+        first, own = result.unlisted[0], ""
+        if first.stage == "noise" and first.split not in (ALIKE, OPPOSITE):
+            own = f" In the model, split_noise gives {first.split} noise of its own."
+        return [*found, f"No effect of the simulator can be like it, so that its reduction is not measured.{own}"]
     if held is None:
         return [*found, "Its reduction on held-out data is not measured: they do not respond to it by themselves."]
     return [*found, _removed(held, "Added to the simulator, this removes")]

@@ -4,9 +4,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from mcsim.reconstruction.plugin import CONSTANT
 from mcsim.reconstruction.scores import Scene
 from mcsim.reconstruction.structure import ALIKE, ANY, OFFSET, OPPOSITE, Structure
 from mcsim.support.arrays import Matrix, Vector
+from mcsim.support.numbers import measured
 from mcsim.systematics import Library
 from mcsim.systematics.spacecraft import scan_direction
 
@@ -56,6 +58,9 @@ def says(structure: Structure, theta: Vector, covariance: Matrix, scene: Scene) 
     most = _most(theta, covariance, count)
     own = theta.reshape(count, -1)[most] if structure.stage == "beam" else theta
     what = _what(structure, own, scene.frame)
+    if (structure.stage, structure.kind) == ("noise", "level") and structure.split != OPPOSITE:
+        share, error = 100.0 / CONSTANT * theta[0], 100.0 / CONSTANT * np.sqrt(covariance[0, 0])
+        what = f"{what.removesuffix(')')}, {measured(float(share), float(error), ' %')} of its variance)"
     return ", ".join(filter(None, (what, _degrees(structure, spans, most), *_where(structure, scene))))
 
 

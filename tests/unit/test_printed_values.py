@@ -96,8 +96,11 @@ def test_durations_are_said_in_a_unit_that_people_use(seconds, words):
 )
 def test_a_reduction_that_no_effect_can_make_is_said_so(files, why):
     """Further structures are what the first one leaves: without an effect of that, none is added."""
-    found = tuple(SimpleNamespace(sentence="Something.", file=file) for file in files)
-    assert why in words.unlisted(SimpleNamespace(unlisted=found, unlisted_held_out=None))[-1]
+    noise = {"stage": "noise", "split": "half1"}
+    found = tuple(SimpleNamespace(sentence="Something.", file=file, **noise) for file in files)
+    said = words.unlisted(SimpleNamespace(unlisted=found, unlisted_held_out=None))[-1]
+    assert why in said
+    assert ("split_noise gives half1 noise of its own" in said) == (files[0] is None)
 
 
 @pytest.mark.parametrize("found", [(), (SimpleNamespace(says="is proportional to the sky, W1 alone"),)])

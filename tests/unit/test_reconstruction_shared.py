@@ -12,9 +12,9 @@ from mcsim.datavector.settings import DiagnosisSettings
 from mcsim.datavector.wiener_filter import wiener_filter
 from mcsim.reconstruction import simulated_scores, words
 from mcsim.reconstruction.grammar import structures
-from mcsim.reconstruction.plugin import plugin
+from mcsim.reconstruction.plugin import CONSTANT, plugin
 from mcsim.reconstruction.scores import GROWTH
-from mcsim.reconstruction.structure import ALIKE
+from mcsim.reconstruction.structure import ALIKE, OPPOSITE
 from mcsim.simulation import simulate
 from mcsim.simulation.survey import survey
 
@@ -156,3 +156,19 @@ def test_orientations_are_counted_from_the_scan_whatever_the_frame_of_maps(stage
     expected = size * np.array([0.6, -0.8]) @ structure.of(u)
     # The angle between the meridians is that at the centres of pixels.
     assert abs(sum(r @ one for r, one in products) - expected) < 0.1 * scale
+
+
+@pytest.mark.parametrize(
+    ("split", "size"), [("half1", "21.0 % ± 0.7 % of its variance), W1 alone, in half1 alone"), (OPPOSITE, "")]
+)
+def test_a_level_of_noise_is_told_with_its_size(split, size):
+    """Of one split no effect of the simulator makes it, so that nothing else says how large it is."""
+    scene = simulated_scores.scene_of(
+        model_of(survey(config.load(two_channels("noise", **SMALL)), orders=2), DiagnosisSettings())
+    )
+    level = next(w for w in structures(scene) if w.says[:5] == ("noise", "", "", "level", "W1"))
+    theta, covariance = np.array([0.21 * CONSTANT]), np.array([[(0.007 * CONSTANT) ** 2]])
+    said = words.says(replace(level, split=split), theta, covariance, scene)
+    assert said.startswith("is noise (everywhere alike")
+    assert size in said
+    assert ("%" in said) == bool(size)
