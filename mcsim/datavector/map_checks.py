@@ -17,6 +17,7 @@ from mcsim.ensemble.external_maps import in_uk, parts_of
 from mcsim.ensemble.maps import POINTING, file_names, first_realization
 from mcsim.errors import InputError
 from mcsim.simulation import simulate
+from mcsim.simulation.survey import SurveyMap
 from mcsim.sphere import alm, healpix, map_files
 from mcsim.sphere.checks import UNSEEN_BELOW
 from mcsim.sphere.header import T_CMB_K, first_table, opened
@@ -45,6 +46,12 @@ def checked_map(model: Model, part: Part, map_: Map, name: str) -> Map:
         raise InputError(
             f"{name} leaves out {100 * lost:.3g} % of the pixels that the fiducial scan hits, at most "
             f"{100 * limits.missing_share:g} % may be; give the model a mask (map.mask) that leaves them out too."
+        )
+    if lost and part.name in (m.name for channel in model.survey.channels for m in channel.maps if _quiet(m)):
+        raise InputError(
+            f"{name} leaves out {round(lost * fiducial.sum())} pixels that the model observes, and the model has no "
+            "noise in it, or hardly any: nothing in their place is as exact as the map; give the model a mask "
+            "(map.mask) that leaves them out too, or noise."
         )
     seen = map_[fiducial & (map_ != healpy.UNSEEN)]
     values, counts = np.unique(seen, return_counts=True)
@@ -228,12 +235,17 @@ def _share_of(pattern: Map, model: Model, part: Part, map_: Map, seen: NDArray[n
     return float(t[seen] @ map_[seen]) / square, float(np.sqrt(sky + noise)) / square
 
 
+def _quiet(map_: SurveyMap) -> bool:
+    """Return True for a map of the model without noise, or with hardly any."""
+    return map_.noise_uk is None or bool(np.max(map_.noise_uk) < QUIET)
+
+
 def check_splits_differ(model: Model) -> None:
     """Raise InputError for two maps of a channel that are simulated alike: nothing is measured by their difference.
 
     Its numbers would be constant, or have the scatter of round-off alone.
     """
-    each = [[m for m in c.maps if m.noise_uk is None or np.max(m.noise_uk) < QUIET] for c in model.survey.channels]
+    each = [[m for m in c.maps if _quiet(m)] for c in model.survey.channels]
     quiet = [pair for maps in each for pair in combinations(maps, 2)]
     if not quiet:
         return
