@@ -237,6 +237,11 @@ class DataSet(ABC, Generic[Data]):
         return []
 
     @property
+    def noise_of_splits(self) -> list[str]:
+        """Return sentences on channels whose splits do not have the model's noise alike."""
+        return []
+
+    @property
     def instead(self) -> list[str]:
         """Return sentences on what describes the data and is no effect: noise in common, or another order of maps."""
         return (self.noise_in_common if self.gap.pvalue <= self.context.settings.alpha else []) or self.exchanged

@@ -106,6 +106,7 @@ def inferred(data: DataSet) -> Inferred:
     notes += refusals
     if found.verdict == "none":
         notes += data.noise_in_common
+    notes += data.noise_of_splits
     for own in found.explanations[:1] if detected is None else [detected]:
         notes += as_seen(context, own.members, own.fit)
     refined = replace(refined, attribution=found, partial=detected)

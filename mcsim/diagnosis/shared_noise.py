@@ -39,11 +39,15 @@ class CrossPowers:
     drawn: Matrix
 
     @cached_property
-    def pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of maps, by number, that have white noise, before any preparation."""
+    def white(self) -> list[int]:
+        """Return the maps, by number, that have white noise, before any preparation."""
         maps = enumerate(self.analysis.model.survey.making.maps)
-        white = [number for number, one in maps if one.noise_uk is not None and one.drawn is None]
-        return list(combinations(white, 2))
+        return [number for number, one in maps if one.noise_uk is not None and one.drawn is None]
+
+    @cached_property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Return the pairs of these maps."""
+        return list(combinations(self.white, 2))
 
     @cached_property
     def rows(self) -> Rows:
@@ -65,8 +69,16 @@ class CrossPowers:
     @cached_property
     def responses(self) -> Matrix:
         """Return their responses to the correlation of each pair, shape (powers, pairs)."""
+        return self._responses(self.pairs)
+
+    @cached_property
+    def levels(self) -> Matrix:
+        """Return their responses to half the change of the variance of each map's noise, shape (powers, maps)."""
+        return self._responses([(number, number) for number in self.white])
+
+    def _responses(self, pairs: Sequence[tuple[int, int]]) -> Matrix:
         elements = self.analysis.bipolar_scan.elements
-        return _responses_of_powers(self.analysis, self.pairs, [elements[row].ell or (0, -1) for row in self.rows[0]])
+        return _responses_of_powers(self.analysis, pairs, [elements[row].ell or (0, -1) for row in self.rows[0]])
 
 
 def shared_noise(
