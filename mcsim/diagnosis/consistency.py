@@ -34,8 +34,8 @@ FOLDS = {
 class Comparison:
     """Hold the amplitudes of one effect in independent parts of the data, beside the other effects of its set."""
 
-    #: kind, slices: what the data are divided by ("halves", "degrees", "hemispheres", "map": the largest scales of one
-    #: map, against all of the data), and the parts in words
+    #: kind, slices: what the data are divided by ("halves", "degrees", "hemispheres", "splits", "map": the largest
+    #: scales of one map, against all of the data), and the parts in words
     kind: str
     slices: tuple[str, ...]
     #: amplitudes, errors: of each part, over the amplitude of the fit
@@ -66,6 +66,11 @@ class Findings:
 
     comparisons: tuple[tuple[Comparison, ...], ...] = ()
     maps: tuple[MapCheck, ...] = ()
+
+    def with_further(self, comparisons: Sequence[tuple[Comparison, ...]]) -> "Findings":
+        """Return findings with further comparisons of each effect."""
+        pairs = zip(self.comparisons, comparisons, strict=True)
+        return replace(self, comparisons=tuple(own + further for own, further in pairs))
 
     @property
     def pvalue(self) -> float:

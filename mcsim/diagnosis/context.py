@@ -18,6 +18,7 @@ from mcsim.datavector.localisation import Place
 from mcsim.datavector.nuisances import with_nuisances
 from mcsim.datavector.null_ensemble import NullEnsemble
 from mcsim.datavector.settings import DiagnosisSettings
+from mcsim.diagnosis.noise_of_splits import NoiseOfSplits
 from mcsim.diagnosis.shared_noise import CrossPowers
 from mcsim.stats.gaussian import SimulatedGaussian, WhitenedTemplates
 from mcsim.stats.look_elsewhere import Calibration, GlobalTest, global_test
@@ -237,8 +238,8 @@ class DataSet(ABC, Generic[Data]):
         return []
 
     @property
-    def noise_of_splits(self) -> list[str]:
-        """Return sentences on channels whose splits do not have the model's noise alike."""
+    def noise_of_splits(self) -> list[NoiseOfSplits]:
+        """Return the noise of the splits of each channel over that of the model, where it is measured."""
         return []
 
     @property

@@ -16,6 +16,7 @@ from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.drawn import as_seen
 from mcsim.diagnosis.found_noise import in_words, with_found_noise
 from mcsim.diagnosis.naming import agreeing, probable, unconfirmed
+from mcsim.diagnosis.noise_of_splits import certain
 from mcsim.diagnosis.partial import PartialSearch
 from mcsim.diagnosis.refine import Refined, Refiner
 from mcsim.diagnosis.result import DiagnosisResult
@@ -106,7 +107,7 @@ def inferred(data: DataSet) -> Inferred:
     notes += refusals
     if found.verdict == "none":
         notes += data.noise_in_common
-    notes += data.noise_of_splits
+    notes += certain(data.noise_of_splits)
     for own in found.explanations[:1] if detected is None else [detected]:
         notes += as_seen(context, own.members, own.fit)
     refined = replace(refined, attribution=found, partial=detected)

@@ -7,7 +7,7 @@ import numpy as np
 
 from mcsim import config
 from mcsim.datavector.candidate import Candidate, parts_of
-from mcsim.diagnosis.consistency import Action, Slices, contradiction
+from mcsim.diagnosis.consistency import Action, Comparison, Slices, contradiction
 from mcsim.diagnosis.context import DataSet, DiagnosisContext
 from mcsim.diagnosis.crossed import together
 from mcsim.diagnosis.drawn import is_drawn
@@ -15,7 +15,7 @@ from mcsim.diagnosis.refine import Refined
 from mcsim.diagnosis.selection import Attribution, Explanation
 from mcsim.stats.scattered import GROWS
 from mcsim.support.arrays import Matrix
-from mcsim.systematics import if_possible
+from mcsim.systematics import acts_through, if_possible
 
 
 def probable(context: DiagnosisContext, refined: Refined) -> tuple[Attribution, list[str]]:
@@ -56,7 +56,8 @@ def agreeing(data: DataSet, refined: Refined, found: Attribution) -> tuple[Attri
                 sentences.append(_doubt(candidates, [one], why))
                 continue
         elif len(kept) < settings.compared_sets:
-            one = replace(one, findings=slices.findings(members, list(_actions(data, refined, one))))
+            findings = slices.findings(members, list(_actions(data, refined, one)))
+            one = replace(one, findings=findings.with_further(_of_splits(data, one)))
             if one.findings.contradict(settings):
                 effects = [candidates[k].fitted(*part) for k, *part in parts_of(candidates, one.members, one.fit)]
                 doubted.append((one, contradiction(one.findings, members, effects, settings.consistency_level)))
@@ -145,6 +146,22 @@ def _actions(data: DataSet, refined: Refined, one: Explanation) -> Iterator[Acti
             pair = None if draws or known else (before, after)
         action = Action.of(response, t, theta, (1.0 + added) * covariance, scatters)
         yield replace(action, growth=growth, wider=max(growth, float(np.sqrt(1.0 + added))), pair=pair)
+
+
+def _of_splits(data: DataSet, one: Explanation) -> list[tuple[Comparison, ...]]:
+    """Return for each effect of a set its amplitudes in splits, if it alone acts on the noise of a channel, evenly."""
+    candidates, model = data.context.candidates, data.context.analysis.model
+    splits = {own.channel: own for own in data.noise_of_splits}
+    noisy = [candidates[k].channel for k in one.members if acts_through(candidates[k].effect, "noise")]
+    found: list[tuple[Comparison, ...]] = [() for _ in one.members]
+    for place, (member, *at) in enumerate(parts_of(candidates, one.members, one.fit) if splits else ()):
+        candidate = candidates[member]
+        if candidate.channel in splits and noisy.count(candidate.channel) == 1:
+            with if_possible():
+                factor = model.noise_factor(candidate.detected(*at), model.channels.index(candidate.channel))
+                if factor is not None and np.ptp(factor) == 0.0 and factor[0] != 1.0:
+                    found[place] = (splits[candidate.channel].compared(float(np.sqrt(factor[0]))),)
+    return found
 
 
 def _beside(data: DataSet, refined: Refined, one: Explanation, member: int, table: config.Effect) -> Iterator[Matrix]:

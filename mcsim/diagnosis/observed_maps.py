@@ -15,7 +15,7 @@ from mcsim.datavector.map_checks import exchanges, share_left_out
 from mcsim.datavector.nuisances import half_given_other
 from mcsim.datavector.same_skies import SameSkies, Skies
 from mcsim.diagnosis.context import DataSet, over_steps
-from mcsim.diagnosis.noise_of_splits import noise_of_splits
+from mcsim.diagnosis.noise_of_splits import NoiseOfSplits, noise_of_splits
 from mcsim.diagnosis.output import DIGEST, digest
 from mcsim.diagnosis.shared_noise import shared_noise
 from mcsim.support.arrays import Map, Matrix, Vector
@@ -188,10 +188,9 @@ class ObservedMaps(DataSet[Sequence[Map]]):
         return [] if sentence is None else [sentence]
 
     @cached_property
-    def noise_of_splits(self) -> list[str]:
-        """Return sentences on channels whose splits do not have the model's noise alike."""
-        known = self.context.of_model
-        return noise_of_splits(known.cross_powers, known.settings.residual_level, self._measured[1])
+    def noise_of_splits(self) -> list[NoiseOfSplits]:
+        """Return the noise of the splits of each channel over that of the model, where it is measured."""
+        return noise_of_splits(self.context.of_model.cross_powers, self._measured[1])
 
     @property
     def folds(self) -> tuple[str, str]:

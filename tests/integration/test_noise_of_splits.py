@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from instruments import ask, data_of, learned_small
+from mcsim.diagnosis.noise_of_splits import certain
 from mcsim.diagnosis.observed_maps import ObservedMaps
 from mcsim.diagnosis.verdict import diagnose_data
 from mcsim.simulation import simulate
@@ -23,7 +24,7 @@ def with_noise(small, factors, seed):
 
 
 @pytest.mark.parametrize("split", [0, 1])
-def test_noise_of_one_split_is_told_with_its_size(small, split):
+def test_noise_of_one_split_is_no_level_of_the_channel_and_told_with_its_size(small, split):
     """It was a noise level of the channel, half as large, and parts of the data agreed."""
     factors = np.ones(4)
     factors[2 + split] = 1.3
@@ -35,12 +36,23 @@ def test_noise_of_one_split_is_told_with_its_size(small, split):
     sizes = [one.partition(" in ")[0].split(" ± ") for one in told]
     for (value, error), factor in zip(sizes, factors[2:], strict=True):
         assert abs(float(value) - factor) < 4.0 * float(error) < 0.3
+    assert found.kind == "unknown"
+    (refused,) = (one for one in found.contradicted if [own.name for own in one.effects] == ["noise_level"])
+    (own,) = (one for (each,) in [refused.effects] for one in each.consistency if one.kind == "splits")
+    assert own.pvalue < 1e-4
+    assert own.slices == ("half1", "half2")
 
 
 def test_noise_of_all_splits_alike_is_an_effect_without_a_note(small):
-    assert not with_noise(small, [1.0, 1.0, 1.3, 1.3], 900).noise_of_splits
+    found = diagnose_data(with_noise(small, [1.0, 1.0, 1.3, 1.3], 900), "alike")
+    assert [one.name for one in found.effects] == ["noise_level"]
+    assert not any("split_noise" in one for one in found.notes)
+    (own,) = (one for one in found.effects[0].consistency if one.kind == "splits")
+    assert np.all(np.abs(np.array(own.amplitudes) - 1.0) < 4.0 * np.array(own.errors))
+    assert np.all(np.array(own.errors) < 0.15)
 
 
 def test_perfect_maps_have_no_such_note(small):
     made = data_of(small.run)
-    assert not any(ObservedMaps(small, list(simulate.maps(made, r)), ask).noise_of_splits for r in range(12))
+    each = (ObservedMaps(small, list(simulate.maps(made, r)), ask).noise_of_splits for r in range(12))
+    assert not any(certain(one) for one in each)
