@@ -36,6 +36,7 @@ def test_a_set_behind_others_that_parts_contradict_is_compared_too(monkeypatch):
 
     monkeypatch.setattr(naming, "slices_of", lambda data: SimpleNamespace(findings=findings))
     monkeypatch.setattr(naming, "_actions", lambda *_: [])
+    monkeypatch.setattr(naming, "_of_splits", lambda *_: [()])
     context = SimpleNamespace(settings=settings, candidates=candidates, run=SimpleNamespace(channels=[]))
     agreed, sentences = naming.agreeing(data_of(context), SimpleNamespace(templates=None), found)
     assert compared == list("ABCDEF")
@@ -50,9 +51,10 @@ def of_two(monkeypatch, odds, probability, pvalue):
     each = tuple(Explanation((k,), fit, own, 0.5, 0.5) for k, own in enumerate((1.0, odds)))
     found = Attribution("degenerate", None, each, 0, 1.0, (fit, fit), (), probability)
     bad = Findings(maps=(MapCheck(("A",), 9.0, 9.0, 1.0, 1, pvalue),), comparisons=((),))
-    results = iter([bad, Findings()])
+    results = iter([bad, Findings(comparisons=((),))])
     monkeypatch.setattr(naming, "slices_of", lambda data: SimpleNamespace(findings=lambda *_: next(results)))
     monkeypatch.setattr(naming, "_actions", lambda *_: [])
+    monkeypatch.setattr(naming, "_of_splits", lambda *_: [()])
     context = SimpleNamespace(settings=DiagnosisSettings(), candidates=candidates, run=SimpleNamespace(channels=[]))
     return *naming.agreeing(data_of(context), SimpleNamespace(templates=None), found), bad
 
