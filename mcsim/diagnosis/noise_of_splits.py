@@ -8,7 +8,7 @@ import numpy as np
 from scipy import stats
 
 from mcsim.diagnosis.consistency import Comparison
-from mcsim.diagnosis.shared_noise import LEVEL, NEARLY, CrossPowers
+from mcsim.diagnosis.shared_noise import LEVEL, CrossPowers
 from mcsim.stats.gaussian import Fit, SimulatedGaussian
 from mcsim.support.arrays import Vector
 from mcsim.support.numbers import measured, p_equals
@@ -59,14 +59,14 @@ def noise_of_splits(powers: CrossPowers, bipolar_scan: Vector) -> list[NoiseOfSp
     several = [channel for channel in dict.fromkeys(channels) if channels.count(channel) > 1]
     if not (powers.rows.size and several):
         return []
-    x, drawn = bipolar_scan[powers.rows.ravel()], powers.drawn[:, powers.rows.ravel()]
-    if np.max(np.abs(x - powers.null.mean) / drawn.std(axis=0)) < NEARLY:
+    x = bipolar_scan[powers.rows.ravel()]
+    if not powers.depart(x):
         return []
     first = _factors(powers.null.fit(x, powers.levels))
     of_map = np.ones(len(model.parts))
     of_map[maps] = np.maximum(first, LEAST)
     pairs = np.array([of_map[i] * of_map[j] for i, j in combinations_with_replacement(range(len(of_map)), 2)])
-    scattered = powers.null.mean + (drawn - powers.null.mean) * np.repeat(pairs, powers.rows.shape[1])
+    scattered = powers.null.mean + (powers.simulations - powers.null.mean) * np.repeat(pairs, powers.rows.shape[1])
     fit = SimulatedGaussian.from_simulations(scattered).fit(x, powers.levels)
     if fit.pvalue <= powers.analysis.settings.residual_level:
         return []

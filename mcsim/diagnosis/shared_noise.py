@@ -64,7 +64,16 @@ class CrossPowers:
     @cached_property
     def null(self) -> SimulatedGaussian:
         """Return the distribution of these powers."""
-        return SimulatedGaussian.from_simulations(self.drawn[:, self.rows.ravel()])
+        return SimulatedGaussian.from_simulations(self.simulations)
+
+    @cached_property
+    def simulations(self) -> Matrix:
+        """Return these powers of the simulations, shape (simulations, powers)."""
+        return self.drawn[:, self.rows.ravel()]
+
+    def depart(self, powers: Vector) -> bool:
+        """Return True if some power is so far from the simulations that noise is worth fitting."""
+        return bool(np.max(np.abs(powers - self.null.mean) / self.simulations.std(axis=0)) >= NEARLY)
 
     @cached_property
     def responses(self) -> Matrix:
@@ -92,7 +101,7 @@ def shared_noise(
     if not (powers.rows.size and powers.pairs):
         return None
     y = bipolar_scan[powers.rows.ravel()]
-    if np.max(np.abs(y - powers.null.mean) / powers.drawn[:, powers.rows.ravel()].std(axis=0)) < NEARLY:
+    if not powers.depart(y):
         return None
     fit = powers.null.fit(y, powers.responses)
     size = np.abs(fit.amplitudes) / np.maximum(fit.errors, 1e-300)
